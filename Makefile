@@ -1,0 +1,83 @@
+# Needs Python 3.11 or 3.12, make and a network; all else comes from the lock in requirements/.
+PYTHON ?= python3
+VENV := .venv
+GPU :=
+ARGS :=
+
+BIN := $(VENV)/bin
+UV_VERSION := 0.13.9
+
+ifeq ($(filter "$(GPU)","" "cuda12" "cuda13"),)
+$(error GPU is cuda12 or cuda13, or left out for the CPU, and not '$(GPU)')
+endif
+
+# The stamp is written last and names the lock, so that half an environment is never taken for a
+# whole one. `make setup` without GPU means the CPU; the others keep what is installed.
+INSTALLED := $(patsubst $(VENV)/.locked-%,%,$(wildcard $(VENV)/.locked-*))
+LOCK := $(or $(GPU),$(if $(filter setup,$(MAKECMDGOALS)),,$(INSTALLED)),cpu)
+STAMP := $(VENV)/.locked-$(LOCK)
+
+PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
+SUPPORTED := import sys; sys.exit(sys.version_info[:2] not in {(3, 11), (3, 12)})
+
+.PHONY: help setup train test test-slow format lock clean
+
+help:
+	@echo "make setup      build $(VENV) from the lock; GPU=cuda12 or GPU=cuda13 for NVIDIA"
+	@echo "make train      train; ARGS=\"...\" goes to train.py"
+	@echo "make test       ruff, mypy and the default tests"
+	@echo "make test-slow  the tests marked slow"
+	@echo "make format     let ruff rewrite the sources"
+	@echo "make lock       resolve the lock again; ARGS=--upgrade for the newest versions"
+	@echo "make clean      remove caches and built packages (not $(VENV), not runs/)"
+	@echo "PYTHON=...      the Python 3.11 or 3.12 that $(VENV) is built with (python3)"
+
+setup: $(STAMP)
+	@echo "$(VENV) is ready ($(LOCK), $$($(BIN)/python --version)): make train, make test, $(BIN)/mjx-arm --help"
+
+$(VENV)/.locked-%: requirements/%.txt
+	@$(PYTHON) -c "$(SUPPORTED)" 2>/dev/null || \
+	  { echo "Python 3.11 or 3.12 is needed, and '$(PYTHON)' is neither: try make PYTHON=python3.12" >&2; exit 2; }
+	@test ! -e $(VENV) || test -e $(VENV)/pyvenv.cfg || \
+	  { echo "$(VENV) is there and is no virtual environment: move it away" >&2; exit 2; }
+	@echo "Installing $< into $(VENV): minutes, the first time."
+	@rm -f $(VENV)/.locked-*
+	@$(PYTHON) -m venv --clear $(VENV)
+	@$(PIP) --require-hashes --only-binary :all: -r $<
+	@$(PIP) --no-build-isolation --no-deps --editable .
+	@touch $@
+
+train: $(STAMP)
+	$(BIN)/python train.py $(ARGS)
+
+test: $(STAMP)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/python -m pytest
+
+test-slow: $(STAMP)
+	$(BIN)/python -m pytest -m slow
+
+format: $(STAMP)
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+lock: .venv-lock/bin/uv-$(UV_VERSION)
+	@$(call compile,cpu)
+	@$(call compile,cuda12,--extra cuda12)
+	@$(call compile,cuda13,--extra cuda13)
+
+# One file serves Python 3.11 and 3.12, Linux and macOS: markers choose among the versions.
+compile = UV_CUSTOM_COMPILE_COMMAND="make lock" .venv-lock/bin/uv pip compile pyproject.toml \
+  --no-config --quiet --universal --python-version 3.11 --generate-hashes --no-emit-index-url \
+  --extra dev $(2) $(ARGS) --output-file requirements/$(1).txt
+
+.venv-lock/bin/uv-$(UV_VERSION):
+	@$(PYTHON) -m venv --clear .venv-lock
+	@.venv-lock/bin/python -m pip install --quiet --disable-pip-version-check uv==$(UV_VERSION)
+	@touch $@
+
+clean:
+	rm -rf build dist .mypy_cache .pytest_cache .ruff_cache .venv-lock
+	find mjx_arm tests benchmarks -name __pycache__ -type d -prune -exec rm -rf {} + 2>/dev/null || true
