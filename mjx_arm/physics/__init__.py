@@ -1,0 +1,48 @@
+"""Physics of a scene behind one record of functions, by either of two backends."""
+
+from __future__ import annotations
+
+import importlib.util
+
+import jax
+
+from mjx_arm.physics.base import Physics, PhysicsState
+from mjx_arm.scene import Scene, resolve_task
+
+__all__ = ["BACKENDS", "Physics", "PhysicsState", "make_physics"]
+
+BACKENDS = ("auto", "mjx", "mjx-warp", "native")
+
+
+def make_physics(scene: Scene, backend: str = "auto") -> Physics:
+    """Makes the physics of a scene.
+
+    Args:
+      scene: a scene of the task; it says how many substeps an iteration has.
+      backend: `"native"` (MuJoCo's C++ thread pool; CPU), `"mjx"`, `"mjx-warp"` (needs the extra
+        `warp`), or `"auto"`: native where jax runs on CPU, mjx elsewhere.
+
+    Returns:
+      The record of functions.
+
+    Raises:
+      ValueError: unknown backend, `mjx-warp` without its extra, or a scene that is not the task's.
+    """
+    if backend not in BACKENDS:
+        raise ValueError(f"unknown physics {backend!r}: give one of {', '.join(BACKENDS)}")
+    if backend == "auto":
+        backend = "native" if jax.default_backend() == "cpu" else "mjx"
+    if backend == "mjx-warp" and importlib.util.find_spec("warp") is None:
+        raise ValueError(
+            "physics 'mjx-warp' needs the extra 'warp': pip install 'mjx-arm[warp]', "
+            "or give physics='mjx'"
+        )
+    substeps = resolve_task(scene).substeps
+    if backend == "native":
+        from mjx_arm.physics.native import make_native
+
+        return make_native(scene.mj_model, substeps)
+    # MJX takes seconds to import, and the native backend does without it.
+    from mjx_arm.physics.mjx import make_mjx
+
+    return make_mjx(scene.mj_model, substeps, impl="warp" if backend == "mjx-warp" else "jax")

@@ -1,0 +1,64 @@
+"""Physics by MuJoCo MJX, on any device that jax runs on."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import mujoco
+from mujoco import mjx
+
+from mjx_arm.kinematics import make_kinematics
+from mjx_arm.physics.base import Physics, PhysicsState
+
+# MuJoCo's own bound (mjMAXVAL) above which it calls a simulation unstable.
+_MAX_VALUE = 1e10
+
+
+def make_mjx(mj_model: mujoco.MjModel, substeps: int, impl: str = "jax") -> Physics:
+    """Makes the backend that runs MJX.
+
+    Args:
+      mj_model: the model.
+      substeps: physics substeps in one iteration.
+      impl: MJX's implementation, `"jax"` or `"warp"`.
+
+    Returns:
+      The record of functions.
+    """
+    kinematics = make_kinematics(mj_model)
+    model = mjx.put_model(mj_model, impl=impl)
+    template = mjx.make_data(mj_model, impl=impl)
+
+    def init(qpos: jax.Array, ctrl: jax.Array) -> PhysicsState:
+        del ctrl
+        at_rest = jnp.zeros((mj_model.nv,), jnp.float32)
+        return PhysicsState(
+            qpos=qpos,
+            qvel=at_rest,
+            poses=kinematics(qpos),
+            diverged=jnp.zeros((), jnp.bool_),
+            integration=at_rest,
+        )
+
+    def step(state: PhysicsState, ctrl: jax.Array) -> PhysicsState:
+        data = template.replace(
+            qpos=state.qpos, qvel=state.qvel, ctrl=ctrl, qacc_warmstart=state.integration
+        )
+        data = jax.lax.fori_loop(0, substeps, lambda _, d: mjx.step(model, d), data)
+        after = (data.qpos, data.qvel, data.qacc_warmstart)
+        sane = [jnp.all(jnp.abs(x) < _MAX_VALUE) for x in after]
+        diverged = ~(sane[0] & sane[1] & sane[2])
+        before = (state.qpos, state.qvel, state.integration)
+        qpos, qvel, warmstart = (
+            jnp.where(diverged, old, new) for old, new in zip(before, after, strict=True)
+        )
+        return PhysicsState(
+            qpos=qpos,
+            qvel=qvel,
+            poses=kinematics(qpos),
+            diverged=diverged,
+            integration=warmstart,
+        )
+
+    backend = "mjx" if impl == "jax" else "mjx-warp"
+    return Physics(backend, init, step, substeps, float(mj_model.opt.timestep))
