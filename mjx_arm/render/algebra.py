@@ -1,0 +1,47 @@
+"""Small arithmetic, exact in float32 on every device and cheap inside of a fused kernel."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+
+
+def matvec(matrix: jax.Array, vector: jax.Array) -> jax.Array:
+    """Returns `matrix [m, n]` times `vector [n]`; a dot would lose precision on accelerators."""
+    return jnp.sum(matrix * vector, axis=-1)
+
+
+def matmul(left: jax.Array, right: jax.Array) -> jax.Array:
+    """Returns `left [m, k]` times `right [k, n]`, as `matvec`."""
+    return jnp.sum(left[:, :, None] * right[None, :, :], axis=1)
+
+
+def lesser(a: jax.Array, b: jax.Array) -> jax.Array:
+    """Returns the smaller one: a single instruction, since unlike jnp.minimum it drops NaNs."""
+    return jnp.where(a < b, a, b)
+
+
+def greater(a: jax.Array, b: jax.Array) -> jax.Array:
+    """Returns the larger one; see `lesser`."""
+    return jnp.where(a > b, a, b)
+
+
+def root(x: jax.Array) -> jax.Array:
+    """Returns the square root, 0 where `x` is negative."""
+    return jnp.sqrt(greater(x, jnp.zeros_like(x)))
+
+
+def sign(x: jax.Array) -> jax.Array:
+    """Returns -1 where `x` is negative, else 1: unlike jnp.sign it is never zero."""
+    return jnp.where(x < 0, jnp.full_like(x, -1.0), jnp.full_like(x, 1.0))
+
+
+def perpendicular(axis: jax.Array) -> jax.Array:
+    """Returns two unit vectors, `[2, 3]`, that complete the unit vector `axis [3]` to a basis."""
+    x, y, z = axis
+    s = sign(z)
+    a = -1 / (s + z)
+    b = x * y * a
+    first = jnp.stack([1 + s * x * x * a, s * b, -s * x])
+    second = jnp.stack([b, s + y * y * a, -y])
+    return jnp.stack([first, second])
