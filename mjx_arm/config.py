@@ -21,9 +21,10 @@ class RewardConfig:
         what a step without success can pay, so that finishing outbids hovering (at discount 0.99
         the paper's hovering just below 30 cm is worth 130, its success 100).
       success: paid once on success, both kinds.
-      distance_decay: per `distance_unit`; the paper's 0.25.
+      distance_decay: per `distance_unit`, of the paper's reward; its 0.25.
       distance_unit: m; the paper names none, ours is a decimetre.
       height_unit: m; the unit of the cube's height in the paper's `1 + height`.
+      completion_decay: per `distance_unit`, `completion` only.
       completion_reach: most that a step can pay without a grasp, `completion` only.
       completion_hold: paid for a grasp at height 0, `completion` only.
       completion_lift: paid on top in proportion to the height, reached just below success.
@@ -35,6 +36,7 @@ class RewardConfig:
     distance_decay: float = 0.25
     distance_unit: float = 0.1
     height_unit: float = 1.0
+    completion_decay: float = 1.0
     completion_reach: float = 0.3
     completion_hold: float = 0.4
     completion_lift: float = 0.4
@@ -43,7 +45,7 @@ class RewardConfig:
     def __post_init__(self) -> None:
         """Raises ValueError for a value out of its domain."""
         _one_of("reward", self.kind, REWARDS)
-        for name in ("distance_decay", "distance_unit", "height_unit", "scale"):
+        for name in ("distance_decay", "completion_decay", "distance_unit", "height_unit", "scale"):
             _positive(f"reward {name}", getattr(self, name))
 
 
@@ -136,3 +138,146 @@ def _one_of(what: str, value: Any, known: tuple[str, ...]) -> None:
 def _positive(name: str, value: float) -> None:
     if not value > 0:
         raise ValueError(f"{name} is {value}: give a number above 0")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class TrainConfig:
+    """Options of a training run.
+
+    Where James & Johns 2016 state a value, preset `paper` has it; all others are our choice.
+
+    Attributes:
+      env: environment, `"A"` or `"B"`.
+      physics: `"auto"`, `"mjx"`, `"mjx-warp"` or `"native"`.
+      scene: a scene's name, or the path of an MJCF file with the task's names.
+      observation: what the network sees: `"packed"` pixels, or `"state"` features.
+      size: height and width of the image, pixels.
+      shadows: hard shadows in the image.
+      reward: `"completion"` or `"paper"`; see `RewardConfig`.
+      reward_scale: factor on every reward.
+      max_steps: iterations until an episode is truncated.
+      seed: of everything random.
+      num_envs: environments that run side by side.
+      total_steps: environment steps of the whole run.
+      storage: what the replay keeps of a frame: `"states"` (rendered again when sampled) or
+        `"pixels"`.
+      replay_size: transitions that the replay holds.
+      batch_size: transitions in one update.
+      updates_per_step: updates after each step of all environments.
+      learning_starts: environment steps before the first update.
+      n_step: rewards summed before bootstrapping.
+      gamma: discount of one step.
+      learning_rate: of Adam.
+      max_grad_norm: gradients are clipped to this global norm; 0 for never.
+      double: double Q-learning.
+      dueling: value and advantage streams.
+      huber: Huber loss, else squared.
+      polyak: share of the online parameters in each update of the target's; 0 for copies.
+      target_period: updates between copies, where `polyak` is 0.
+      epsilon_start: share of random actions at the beginning.
+      epsilon_end: and after annealing.
+      epsilon_steps: environment steps over which it falls linearly.
+      widths: channels of the three convolutions.
+      kernels: edges of their kernels, pixels.
+      strides: their strides, pixels.
+      hidden: units of the first dense layer.
+      chunk_steps: environment steps in one compiled call, between two looks at it from outside.
+    """
+
+    env: str = "A"
+    physics: str = "auto"
+    scene: str = "arm_cube"
+    observation: str = "packed"
+    size: tuple[int, int] = (64, 64)
+    shadows: bool = False
+    reward: str = "completion"
+    reward_scale: float = 0.2
+    max_steps: int = 1000
+    seed: int = 0
+    num_envs: int = 32
+    total_steps: int = 1_500_000
+    storage: str = "states"
+    replay_size: int = 200_000
+    batch_size: int = 64
+    updates_per_step: int = 1
+    learning_starts: int = 5_000
+    n_step: int = 5
+    gamma: float = 0.99
+    learning_rate: float = 3e-4
+    max_grad_norm: float = 10.0
+    double: bool = True
+    dueling: bool = True
+    huber: bool = True
+    polyak: float = 0.005
+    target_period: int = 1_000
+    epsilon_start: float = 1.0
+    epsilon_end: float = 0.1
+    epsilon_steps: int = 100_000
+    widths: tuple[int, int, int] = (16, 32, 32)
+    kernels: tuple[int, int, int] = (5, 3, 3)
+    strides: tuple[int, int, int] = (2, 1, 1)
+    hidden: int = 256
+    chunk_steps: int = 16_384
+
+    def __post_init__(self) -> None:
+        """Raises ValueError for a value out of its domain."""
+        _one_of("environment", self.env, tuple(ENVIRONMENTS))
+        _one_of("physics", self.physics, BACKENDS)
+        _one_of("observation", self.observation, ("packed", "state"))
+        _one_of("reward", self.reward, REWARDS)
+        _one_of("storage", self.storage, ("states", "pixels"))
+        for name in _COUNTS:
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} is {getattr(self, name)}: give at least 1")
+        for name in ("learning_rate", "reward_scale"):
+            _positive(name, getattr(self, name))
+        for name in ("epsilon_start", "epsilon_end", "gamma", "polyak"):
+            if not 0.0 <= getattr(self, name) <= 1.0:
+                raise ValueError(f"{name} is {getattr(self, name)}: give 0 to 1")
+        if self.replay_slots <= self.n_step:
+            raise ValueError(
+                f"replay_size is {self.replay_size}: give more than n_step * num_envs = "
+                f"{self.n_step * self.num_envs}"
+            )
+        if self.replay_size < self.batch_size:
+            raise ValueError(
+                f"replay_size is {self.replay_size}: give at least batch_size = {self.batch_size}"
+            )
+
+    @property
+    def replay_slots(self) -> int:
+        """Time steps that the replay holds, for each environment."""
+        return self.replay_size // self.num_envs
+
+    @property
+    def chunk_length(self) -> int:
+        """Steps of all environments in one compiled call."""
+        return max(1, self.chunk_steps // self.num_envs)
+
+    def env_config(self) -> EnvConfig:
+        """Options of the environment that this run trains in."""
+        return env_config(
+            self.env,
+            physics=self.physics,
+            scene=self.scene,
+            observation=self.observation,
+            size=self.size,
+            shadows=self.shadows,
+            reward=RewardConfig(kind=self.reward, scale=self.reward_scale),
+            max_steps=self.max_steps,
+        )
+
+
+_COUNTS = (
+    "num_envs",
+    "total_steps",
+    "replay_size",
+    "batch_size",
+    "updates_per_step",
+    "n_step",
+    "target_period",
+    "epsilon_steps",
+    "hidden",
+    "chunk_steps",
+    "max_steps",
+)

@@ -34,13 +34,13 @@ def reward_terms(
     Returns:
       `reach`, `hold`, `lift` and `success`, each `[] float32`.
     """
-    decay = config.distance_decay / config.distance_unit
-    reach = jnp.exp(-decay * distance)
+    units = distance / config.distance_unit
     if config.kind == "paper":
+        reach = jnp.exp(-config.distance_decay * units)
         hold = jnp.ones_like(height)
         lifted = height / config.height_unit
     else:
-        reach = config.completion_reach * reach
+        reach = config.completion_reach * jnp.exp(-config.completion_decay * units)
         hold = jnp.full_like(height, config.completion_hold)
         lifted = config.completion_lift * jnp.clip(height / lift, 0.0, 1.0)
     zero = jnp.zeros_like(height)

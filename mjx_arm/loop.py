@@ -1,0 +1,313 @@
+"""The training loop: collect, store, learn and count in one body, a chunk of it in one scan."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+
+from mjx_arm.auto_reset import AutoReset, AutoResetState
+from mjx_arm.config import TrainConfig
+from mjx_arm.dqn import DQN, Learner, epsilon_greedy
+from mjx_arm.env import Env, Transition, make_env
+from mjx_arm.kinematics import make_kinematics
+from mjx_arm.networks import FeatureQNetwork, PixelQNetwork
+from mjx_arm.replay import Replay, Step, add, init_replay, sample
+
+Obs = Any
+Counts = dict[str, jax.Array]
+
+
+@flax.struct.dataclass
+class LoopState:
+    """Everything that training changes; the carry of the scan.
+
+    Attributes:
+      learner: networks and optimiser.
+      envs: `[N]` environments.
+      obs: `[N, ...]`, what the agent sees of them. Carried, so that it is drawn once: on CPU XLA
+        casts the rays again for every consumer that it can fuse with.
+      replay: the ring.
+      key: PRNG key.
+      vector_step: `[] int32`, steps of all environments so far.
+      episode: running sums of the episodes under way, `[N]` each.
+      counts: sums over all steps so far, `[] float32` and `[] int32`.
+    """
+
+    learner: Learner
+    envs: AutoResetState
+    obs: Obs
+    replay: Replay
+    key: jax.Array
+    vector_step: jax.Array
+    episode: dict[str, jax.Array]
+    counts: Counts
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Trainer:
+    """A training run's pure functions.
+
+    Attributes:
+      config: the options.
+      env: the environment that it trains in.
+      dqn: the algorithm.
+      init: `key -> LoopState`.
+      run_chunk: `LoopState -> (LoopState, Counts)`, compiled; donates its argument. The counts are
+        those of the chunk.
+    """
+
+    config: TrainConfig
+    env: Env
+    dqn: DQN
+    init: Callable[[jax.Array], LoopState]
+    run_chunk: Callable[[LoopState], tuple[LoopState, Counts]]
+
+
+def make_trainer(config: TrainConfig) -> Trainer:
+    """Makes the functions of a training run.
+
+    Raises:
+      ValueError: the environment cannot be made.
+    """
+    env = make_env(config.env_config())
+    body = _Body(config, AutoReset(env), make_dqn(config, env), _make_storage(config, env))
+
+    def run_chunk(state: LoopState) -> tuple[LoopState, Counts]:
+        state = dataclasses.replace(state, counts=jax.tree.map(jnp.zeros_like, state.counts))
+        state, _ = jax.lax.scan(body.step, state, None, length=config.chunk_length)
+        return state, state.counts
+
+    return Trainer(
+        config=config,
+        env=env,
+        dqn=body.dqn,
+        init=jax.jit(body.init),
+        run_chunk=jax.jit(run_chunk, donate_argnums=0),
+    )
+
+
+def make_dqn(config: TrainConfig, env: Env) -> DQN:
+    """Makes the algorithm with the network that fits the observation."""
+    if config.observation == "state":
+        network: Any = FeatureQNetwork(env.num_actions, config.hidden, config.dueling)
+    else:
+        network = PixelQNetwork(
+            num_actions=env.num_actions,
+            widths=config.widths,
+            kernels=config.kernels,
+            strides=config.strides,
+            hidden=config.hidden,
+            dueling=config.dueling,
+        )
+    clip = optax.clip_by_global_norm(config.max_grad_norm) if config.max_grad_norm > 0 else None
+    adam = optax.adam(config.learning_rate)
+    return DQN(
+        apply=network.apply,
+        init_params=network.init,
+        optimizer=adam if clip is None else optax.chain(clip, adam),
+        double=config.double,
+        huber=config.huber,
+        polyak=config.polyak,
+        target_period=config.target_period,
+    )
+
+
+def epsilon_at(config: TrainConfig, env_steps: jax.Array) -> jax.Array:
+    """Share of random actions after so many environment steps, `[] float32`."""
+    done = jnp.clip(env_steps.astype(jnp.float32) / config.epsilon_steps, 0.0, 1.0)
+    return config.epsilon_start + (config.epsilon_end - config.epsilon_start) * done
+
+
+@dataclasses.dataclass(frozen=True)
+class _Storage:
+    """What the replay keeps of a frame, and how the observation comes back from it."""
+
+    store: Callable[[AutoResetState, Obs], Any]
+    restore: Callable[[Any], Obs]
+
+
+def _make_storage(config: TrainConfig, env: Env) -> _Storage:
+    if config.storage == "pixels" or config.observation == "state":
+        return _Storage(store=lambda envs, obs: obs, restore=lambda frame: frame)
+    kinematics = make_kinematics(env.scene.mj_model)
+
+    def draw(qpos: jax.Array) -> jax.Array:
+        poses = kinematics(qpos)
+        return env.render(poses.geom_xpos, poses.geom_xmat)
+
+    return _Storage(store=lambda envs, obs: envs.env.physics.qpos, restore=jax.vmap(draw))
+
+
+@dataclasses.dataclass(frozen=True)
+class _Body:
+    """The body of the scan."""
+
+    config: TrainConfig
+    env: AutoReset
+    dqn: DQN
+    storage: _Storage
+
+    def init(self, key: jax.Array) -> LoopState:
+        config = self.config
+        reset_key, learner_key, key = jax.random.split(key, 3)
+        obs, envs = jax.vmap(self.env.reset)(jax.random.split(reset_key, config.num_envs))
+        nothing = jnp.zeros((config.num_envs,), jnp.bool_)
+        step = Step(
+            frame=self.storage.store(envs, obs),
+            action=nothing.astype(jnp.uint8),
+            reward=nothing.astype(jnp.float32),
+            terminated=nothing,
+            truncated=nothing,
+            void=nothing,
+        )
+        zero = jnp.zeros((config.num_envs,), jnp.float32)
+        state = LoopState(
+            learner=self.dqn.init(learner_key, obs[:1]),
+            envs=envs,
+            obs=obs,
+            replay=init_replay(step, config.replay_slots),
+            key=key,
+            vector_step=jnp.zeros((), jnp.int32),
+            episode={name: zero for name in ("length", "return", "max_q", "regrasps", "held")},
+            counts={},
+        )
+        # One abstract step says which counts there are.
+        counts = jax.eval_shape(lambda s: self.step(s, None)[0].counts, state)
+        zeros = {name: jnp.zeros(x.shape, x.dtype) for name, x in counts.items()}
+        return dataclasses.replace(state, counts=zeros)
+
+    def step(self, state: LoopState, _: None) -> tuple[LoopState, None]:
+        key, act_key, env_key, learn_key = jax.random.split(state.key, 4)
+        epsilon = epsilon_at(self.config, state.vector_step * self.config.num_envs)
+        q = self.dqn.apply(state.learner.params, state.obs)
+        action = epsilon_greedy(act_key, q, epsilon)
+        keys = jax.random.split(env_key, self.config.num_envs)
+        envs, transition = jax.vmap(self.env.transition)(keys, state.envs, action)
+        replay = add(state.replay, self._record(state, action, transition))
+        learner, learned = self._learn(learn_key, state.learner, replay)
+        episode, counts = self._count(state, q, transition)
+        counts |= learned
+        state = LoopState(
+            learner=learner,
+            envs=envs,
+            obs=jax.vmap(self.env.env.observe)(envs.env),
+            replay=replay,
+            key=key,
+            vector_step=state.vector_step + 1,
+            episode=episode,
+            counts={name: state.counts.get(name, 0) + count for name, count in counts.items()},
+        )
+        return state, None
+
+    def _record(self, state: LoopState, action: jax.Array, transition: Transition) -> Step:
+        return Step(
+            frame=self.storage.store(state.envs, state.obs),
+            action=action.astype(jnp.uint8),
+            reward=transition.reward,
+            terminated=transition.terminated,
+            truncated=transition.truncated,
+            void=transition.info["reset"] | transition.info["diverged"],
+        )
+
+    def _learn(
+        self, key: jax.Array, learner: Learner, replay: Replay
+    ) -> tuple[Learner, dict[str, jax.Array]]:
+        config = self.config
+
+        def one(learner: Learner, key: jax.Array) -> tuple[Learner, dict[str, jax.Array]]:
+            batch = sample(replay, key, config.batch_size, config.n_step, config.gamma)
+            obs = self.storage.restore(batch.frame)
+            next_obs = self.storage.restore(batch.next_frame)
+            learner, metrics = self.dqn.update(learner, batch, obs, next_obs)
+            return learner, metrics | {"updates": jnp.ones((), jnp.int32)}
+
+        def learn(learner: Learner) -> tuple[Learner, dict[str, jax.Array]]:
+            keys = jax.random.split(key, config.updates_per_step)
+            if config.updates_per_step == 1:
+                return one(learner, keys[0])
+            learner, metrics = jax.lax.scan(one, learner, keys)
+            return learner, jax.tree.map(lambda x: jnp.sum(x, axis=0), metrics)
+
+        def wait(learner: Learner) -> tuple[Learner, dict[str, jax.Array]]:
+            zero = jnp.zeros((), jnp.float32)
+            names = ("loss", "q_mean", "target_max")
+            return learner, {name: zero for name in names} | {"updates": jnp.zeros((), jnp.int32)}
+
+        starts = max(config.learning_starts // config.num_envs, config.n_step + 1)
+        return jax.lax.cond(replay.count > starts, learn, wait, learner)
+
+    def _count(
+        self, state: LoopState, q: jax.Array, transition: Transition
+    ) -> tuple[dict[str, jax.Array], Counts]:
+        info = transition.info
+        stepped = (~info["reset"]).astype(jnp.float32)
+        ended = transition.terminated | transition.truncated
+        held = info["grasped"].astype(jnp.float32)
+        before = state.episode
+        episode = {
+            "length": before["length"] + stepped,
+            "return": before["return"] + transition.reward,
+            "max_q": before["max_q"] + stepped * jnp.max(q, axis=-1),
+            "regrasps": before["regrasps"] + held * (1 - before["held"]),
+            "held": held,
+        }
+        finished = {
+            f"episode_{name}": jnp.sum(jnp.where(ended, episode[name], 0.0))
+            for name in ("length", "return", "max_q")
+        }
+        counts = {
+            "steps": jnp.sum(stepped),
+            "episodes": jnp.sum(ended.astype(jnp.int32)),
+            "successes": jnp.sum(transition.terminated.astype(jnp.int32)),
+            "grasp_steps": jnp.sum(stepped * held),
+            "distance": jnp.sum(stepped * info["distance"]),
+            "grasp_episodes": jnp.sum((ended & (episode["regrasps"] > 0)).astype(jnp.int32)),
+            "diverged": jnp.sum(info["diverged"].astype(jnp.int32)),
+            **finished,
+        }
+        episode = {name: jnp.where(ended, 0.0, total) for name, total in episode.items()}
+        return episode, counts
+
+
+def summarise(config: TrainConfig, counts: dict[str, Any], vector_step: int) -> dict[str, float]:
+    """Means of a chunk, from its counts.
+
+    Args:
+      config: of the run.
+      counts: numbers from `run_chunk`.
+      vector_step: steps of all environments so far.
+
+    Returns:
+      Metrics by name; means over nothing are NaN.
+    """
+    c = {name: float(np.asarray(value)) for name, value in counts.items()}
+
+    def ratio(top: str, bottom: str) -> float:
+        return c[top] / c[bottom] if c[bottom] else float("nan")
+
+    env_steps = vector_step * config.num_envs
+    return {
+        "env_steps": env_steps,
+        "episodes": c["episodes"],
+        "successes": c["successes"],
+        "success_rate": ratio("successes", "episodes"),
+        "grasp_rate": ratio("grasp_episodes", "episodes"),
+        "grasp_share": ratio("grasp_steps", "steps"),
+        "mean_distance": ratio("distance", "steps"),
+        "mean_length": ratio("episode_length", "episodes"),
+        "mean_reward": ratio("episode_return", "episode_length"),
+        "mean_max_q": ratio("episode_max_q", "episode_length"),
+        "loss": ratio("loss", "updates"),
+        "q_mean": ratio("q_mean", "updates"),
+        "target_max": ratio("target_max", "updates"),
+        "updates": c["updates"],
+        "diverged": c["diverged"],
+        "epsilon": float(epsilon_at(config, jnp.asarray(env_steps))),
+    }
