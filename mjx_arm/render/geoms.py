@@ -51,7 +51,7 @@ def validate_geoms(mj_model: mujoco.MjModel) -> None:
             f"the model has {mj_model.ngeom} geoms, but a packed image has ids for {MAX_GEOMS}"
         )
     supported = ", ".join(SUPPORTED_TYPES.values())
-    for geom in np.flatnonzero(visible_geoms(mj_model)):
+    for geom in np.flatnonzero(visible_geoms(mj_model)).tolist():
         geom_type = int(mj_model.geom_type[geom])
         if geom_type not in SUPPORTED_TYPES:
             kind = mujoco.mjtGeom(geom_type).name.removeprefix("mjGEOM_").lower()

@@ -29,7 +29,7 @@ def materialize(packed: jax.Array, *others: jax.Array) -> tuple[jax.Array, ...]:
     return jax.lax.platform_dependent(values, cpu=_branch, default=lambda arrays: arrays)
 
 
-@materialize.def_vmap  # type: ignore[untyped-decorator]
+@materialize.def_vmap
 def _materialize_batch(
     axis_size: int, in_batched: list[bool], *values: jax.Array
 ) -> tuple[tuple[jax.Array, ...], tuple[Any, ...]]:

@@ -227,19 +227,23 @@ def sphere_hit(sphere: Sphere, rays: Rays) -> Hit:
 
 
 class Tube(NamedTuple):
-    """The infinite cylinder about z, crossed at `±sqrt(away² - outside * across²) - ratio * away`.
+    """The infinite cylinder about z.
 
     Attributes:
       away: `[3]`, form of the direction away from the axis.
       across: `[3]`, form of the direction across that and the axis.
-      ratio: `[]`, distance of the camera from the axis over the radius.
-      outside: `[]`, 1 where the camera is outside, -1 where it is inside.
+      distance: `[]`, distance of the camera from the axis, m.
+      radius2: `[]`, squared radius, m².
+      power: `[]`, squared distance minus squared radius, m²; negative inside.
+      inverse_power: `[]`, 1/m².
     """
 
     away: jax.Array
     across: jax.Array
-    ratio: jax.Array
-    outside: jax.Array
+    distance: jax.Array
+    radius2: jax.Array
+    power: jax.Array
+    inverse_power: jax.Array
 
 
 def _make_tube(radius: jax.Array, sight: Sight) -> Tube:
@@ -248,40 +252,55 @@ def _make_tube(radius: jax.Array, sight: Sight) -> Tube:
     on_axis = distance2 < _TINY**2
     distance = jnp.sqrt(jnp.where(on_axis, 1.0, distance2))
     x, y = jnp.where(on_axis, 1.0, x / distance), jnp.where(on_axis, 0.0, y / distance)
-    distance = jnp.where(on_axis, 0.0, distance)
-    power = distance**2 - radius**2
-    outside = sign(power)
-    power = greater(jnp.abs(power), _TINY * radius)
-    away = x * sight.basis[0] + y * sight.basis[1]
-    across = x * sight.basis[1] - y * sight.basis[0]
+    power = distance2 - radius**2
+    power = jnp.where(jnp.abs(power) < _TINY * radius, _TINY * radius, power)
     return Tube(
-        outside * radius / power * away, across / jnp.sqrt(power), distance / radius, outside
+        away=x * sight.basis[0] + y * sight.basis[1],
+        across=x * sight.basis[1] - y * sight.basis[0],
+        distance=jnp.where(on_axis, 0.0, distance),
+        radius2=radius**2,
+        power=power,
+        inverse_power=1 / power,
     )
 
 
-def _tube_ends(tube: Tube, rays: Rays) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Square of the root, the root, and the affine part of `w`, each `[H, W]`."""
+class _TubeHit(NamedTuple):
+    """Entry into a tube, each `[H, W]`: square of the root, `w`, and the tube's two forms."""
+
+    root2: jax.Array
+    w: jax.Array
+    away: jax.Array
+    across2: jax.Array
+
+
+def _enter_tube(tube: Tube, rays: Rays) -> _TubeHit:
     away = affine(tube.away, rays.u, rays.v)
     across = affine(tube.across, rays.u, rays.v)
-    root2 = away * away - across * (across * tube.outside)
-    return root2, root(root2), -tube.ratio * away
+    across2 = across * across
+    root2 = tube.radius2 * (away * away) - tube.power * across2
+    w = (root(root2) - tube.distance * away) * tube.inverse_power
+    return _TubeHit(root2, w, away, across2)
 
 
 class Cylinder(NamedTuple):
-    """A tube cut by a slab.
+    """A tube with flat caps.
 
     Attributes:
       tube: the side.
-      caps: the flat ends.
-      inside: `[]`, huge where the camera is inside of the tube, else minus huge.
+      axial: `[3]`, form of the direction along the axis.
+      height: `[]`, the camera's height along the axis, m.
+      reach: `[]`, half length, m; or -1 where the camera is inside of the tube and sees no side.
+      cap: `[]`, `w` at the cap on the camera's side over `axial`, 1/m; 0 where it sees no cap.
       offset: `[L]`, the camera's offset from the axis along the lights, over the radius.
       direction: `[L, 3]`, forms of the direction off the axis along the lights, over the radius.
-      cosine: `[L]`, cosines of incidence at the cap on the camera's side.
+      cosine: `[L]`, cosines of incidence at that cap.
     """
 
     tube: Tube
-    caps: Slab
-    inside: jax.Array
+    axial: jax.Array
+    height: jax.Array
+    reach: jax.Array
+    cap: jax.Array
     offset: jax.Array
     direction: jax.Array
     cosine: jax.Array
@@ -291,33 +310,37 @@ def cylinder_coefficients(size: jax.Array, sight: Sight) -> Cylinder:
     """Prepares the cylinder of radius `size[0]` and half length `size[1]`, m."""
     radius, half = size[0], size[1]
     tube = _make_tube(radius, sight)
-    caps = _make_slab(sight.origin[2], sight.basis[2], half)
+    height = sight.origin[2]
+    gap = jnp.abs(height) - half
     return Cylinder(
         tube=tube,
-        caps=_never(caps, (tube.outside < 0) & (caps.inside > 0)),
-        inside=-tube.outside * _HUGE,
+        axial=sight.basis[2],
+        height=height,
+        reach=jnp.where(tube.power > 0, half, -1.0),
+        cap=jnp.where(gap > _TINY, -sign(height) / greater(gap, jnp.full_like(gap, _TINY)), 0.0),
         offset=matvec(sight.lights[:, :2], sight.origin[:2]) / radius,
         direction=matmul(sight.lights[:, :2], sight.basis[:2]) / radius,
-        cosine=sign(sight.origin[2]) * sight.lights[:, 2],
+        cosine=sign(height) * sight.lights[:, 2],
     )
 
 
 def cylinder_hit(cylinder: Cylinder, rays: Rays) -> Hit:
     """Casts the rays at a cylinder."""
-    root2, spread, middle = _tube_ends(cylinder.tube, rays)
-    near, far = middle + spread, middle - spread
-    enter_side = greater(near, cylinder.inside)
-    leave_side = greater(far, lesser(near, cylinder.inside))
-    enter_cap, leave_cap = _slab_ends(cylinder.caps, rays)
-    on_side = enter_side < enter_cap
-    w = jnp.where(on_side, enter_side, enter_cap)
-    hit = (root2 >= 0) & (w >= greater(leave_side, leave_cap)) & (w > 0)
+    tube = cylinder.tube
+    side = _enter_tube(tube, rays)
+    axial = affine(cylinder.axial, rays.u, rays.v)
+    rise = cylinder.height * side.w + axial
+    on_side = (side.root2 >= 0) & (jnp.abs(rise) <= cylinder.reach * side.w)
+    w_cap = cylinder.cap * axial
+    run = tube.distance * w_cap + side.away
+    on_cap = (w_cap > 0) & (run * run + side.across2 <= tube.radius2 * (w_cap * w_cap))
+    w = jnp.where(on_cap, w_cap, side.w)
     shading = zip(cylinder.offset, cylinder.direction, cylinder.cosine, strict=True)
     lambert = tuple(
-        jnp.where(on_side, offset * w + affine(form, rays.u, rays.v), cosine * w)
+        jnp.where(on_cap, cosine * w, offset * w + affine(form, rays.u, rays.v))
         for offset, form, cosine in shading
     )
-    return Hit(hit, w, lambert)
+    return Hit(on_cap | (on_side & (w > 0)), w, lambert)
 
 
 class Capsule(NamedTuple):
@@ -360,7 +383,7 @@ def capsule_coefficients(size: jax.Array, sight: Sight) -> Capsule:
     """Prepares the capsule of radius `size[0]` and half length `size[1]`, m."""
     radius, half = size[0], size[1]
     tube = _make_tube(radius, sight)
-    outside = tube.outside > 0
+    outside = tube.power > 0
     height = sight.origin[2]
     rise = height - jnp.stack([half, -half])
     power = sight.origin[0] ** 2 + sight.origin[1] ** 2 + rise**2 - radius**2
@@ -385,14 +408,13 @@ def capsule_coefficients(size: jax.Array, sight: Sight) -> Capsule:
 
 def capsule_hit(capsule: Capsule, rays: Rays) -> Hit:
     """Casts the rays at a capsule."""
-    root2, spread, middle = _tube_ends(capsule.tube, rays)
-    w_side = middle + spread
+    side = _enter_tube(capsule.tube, rays)
     axial = affine(capsule.axial, rays.u, rays.v)
-    rise = capsule.height * w_side + axial
-    on_side = jnp.abs(rise) <= capsule.reach * w_side
+    rise = capsule.height * side.w + axial
+    on_side = jnp.abs(rise) <= capsule.reach * side.w
     w_end, end_root2 = _capsule_end(capsule, rise + capsule.beyond > 0, axial, rays)
-    w = jnp.where(on_side, w_side, w_end)
-    hit = (root2 >= 0) & (on_side | (end_root2 >= 0)) & (w > 0)
+    w = jnp.where(on_side, side.w, w_end)
+    hit = (side.root2 >= 0) & (on_side | (end_root2 >= 0)) & (w > 0)
     # The normal points away from the nearest point of the axis.
     limit = capsule.half * w
     nearest = greater(lesser(capsule.height * w + axial, limit), -limit)

@@ -77,6 +77,17 @@ def make_renderer(
 ) -> RenderWithDepth: ...
 
 
+@overload
+def make_renderer(
+    scene: Scene,
+    *,
+    camera: str = ...,
+    size: tuple[int, int] = ...,
+    shadows: bool = ...,
+    depth: bool = ...,
+) -> Render | RenderWithDepth: ...
+
+
 def make_renderer(
     scene: Scene,
     *,
@@ -87,7 +98,7 @@ def make_renderer(
 ) -> Render | RenderWithDepth:
     """Makes `render(geom_xpos, geom_xmat, appearance=None)`, which draws one frame of a scene.
 
-    The function is pure and may be jitted, and vmapped any number of times. It takes the poses of
+    The function is jitted, and may be vmapped any number of times. It takes the poses of
     all geoms in the order of the model: `geom_xpos [ngeom, 3]`, m, and `geom_xmat [ngeom, 3, 3]`
     or `[ngeom, 9]`; those of geoms welded to the world are ignored, since they are known. It
     returns packed pixels, `[H, W] uint32`: see `rgb` and `segmentation`.
@@ -119,11 +130,9 @@ def make_renderer(
     own = default_appearance(scene, camera)
     plan = _make_plan(scene.mj_model, size, shadows)
     with jax.ensure_compile_time_eval():
-        setting = _make_setting(plan, own)
-        background = cast(plan.still, plan.still_poses, setting, empty_surface(setting))
-    if depth:
-        return functools.partial(_packed_and_depth, plan, own, background)
-    return functools.partial(_packed, plan, own, background)
+        background = jax.jit(functools.partial(_background, plan))(own)
+    draw = _packed_and_depth if depth else _packed
+    return jax.jit(functools.partial(draw, plan, own, background))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -179,6 +188,11 @@ def _make_setting(plan: _Plan, appearance: Appearance) -> Setting:
     return Setting(view, make_rays(view, jnp.stack(lights), plan.size), jnp.stack(lights), unlit)
 
 
+def _background(plan: _Plan, appearance: Appearance) -> Surface:
+    setting = _make_setting(plan, appearance)
+    return cast(plan.still, plan.still_poses, setting, empty_surface(setting))
+
+
 def _draw(
     plan: _Plan,
     own: Appearance,
@@ -192,7 +206,7 @@ def _draw(
     look = own if appearance is None else appearance
     setting = _make_setting(plan, look)
     if appearance is not None:
-        background = cast(plan.still, plan.still_poses, setting, empty_surface(setting))
+        background = _background(plan, appearance)
     surface = cast(plan.moving, poses, setting, background)
     hit = surface.w > 0
     depth = 1 / jnp.where(hit, surface.w, jnp.ones_like(surface.w))
@@ -243,10 +257,10 @@ def _check_poses(geom_xpos: ArrayLike, geom_xmat: ArrayLike, ngeom: int) -> Pose
     return Poses(xpos, xmat.reshape(ngeom, 3, 3))
 
 
-def _validate_size(size: tuple[int, int]) -> None:
+def _validate_size(size: object) -> None:
     if (
-        not isinstance(size, tuple)
+        not isinstance(size, (tuple, list))
         or len(size) != 2
-        or not all(isinstance(n, int) and not isinstance(n, bool) and n > 0 for n in size)
+        or not all(isinstance(length, int | np.integer) and length > 0 for length in size)
     ):
         raise ValueError(f"size={size!r} must be (height, width) in pixels, two positive integers")

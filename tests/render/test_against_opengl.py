@@ -1,0 +1,101 @@
+"""Geom ids and colours against MuJoCo's own renderer."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import jax
+import mujoco
+import numpy as np
+import pytest
+from mujoco_reference import at, geom_poses, random_qpos
+
+from mjx_arm import make_renderer, rgb, segmentation
+from mjx_arm.scene import Scene
+
+POSES = 50
+# OpenGL draws round bodies as polyhedra and rounds coordinates to subpixels.
+MAX_MISMATCH = 0.0015
+MIN_CUBE_IOU = 0.99
+# OpenGL smooths edges and the borders of shadows; the mean of all channels and pixels, of 255.
+MAX_RGB_ERROR = 3.0
+# Away from edges nothing is smoothed: rounding, and colours interpolated between vertices.
+MAX_INTERIOR_ERROR = 1.0
+
+pytestmark = pytest.mark.usefixtures("opengl")
+
+
+@contextmanager
+def _opengl(scene: Scene, size: tuple[int, int]) -> Iterator[mujoco.Renderer]:
+    renderer = mujoco.Renderer(scene.mj_model, *size)
+    try:
+        yield renderer
+    finally:
+        renderer.close()
+
+
+def _opengl_geoms(scene: Scene, qposes: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    images = []
+    with _opengl(scene, size) as renderer:
+        renderer.enable_segmentation_rendering()
+        for qpos in qposes:
+            renderer.update_scene(at(scene.mj_model, qpos), "front")
+            ids, kinds = np.moveaxis(renderer.render(), -1, 0)
+            images.append(np.where(kinds == mujoco.mjtObj.mjOBJ_GEOM, ids, -1))
+    return np.stack(images)
+
+
+def _opengl_rgb(
+    scene: Scene, qposes: np.ndarray, size: tuple[int, int], shadows: bool
+) -> np.ndarray:
+    images = []
+    with _opengl(scene, size) as renderer:
+        renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = shadows
+        for qpos in qposes:
+            renderer.update_scene(at(scene.mj_model, qpos), "front")
+            images.append(renderer.render())
+    return np.stack(images).astype(float)
+
+
+def _interior(geom: np.ndarray) -> np.ndarray:
+    """Pixels `[N, H, W]` whose eight neighbours show the same geom."""
+    inside = np.zeros(geom.shape, bool)
+    centre = geom[:, 1:-1, 1:-1]
+    same = np.ones(centre.shape, bool)
+    height, width = geom.shape[1:]
+    for dy in range(3):
+        for dx in range(3):
+            same &= geom[:, dy : height - 2 + dy, dx : width - 2 + dx] == centre
+    inside[:, 1:-1, 1:-1] = same
+    return inside
+
+
+@pytest.mark.parametrize("size", [(64, 64), (128, 128)])
+def test_geom_ids_match_on_the_arm(arm: Scene, size: tuple[int, int]) -> None:
+    model = arm.mj_model
+    qposes = random_qpos(model, POSES, seed=2)
+    packed = jax.jit(jax.vmap(make_renderer(arm, size=size)))(*geom_poses(model, qposes))
+    geom = np.asarray(segmentation(packed))
+    truth = _opengl_geoms(arm, qposes, size)
+    cube = model.geom("cube").id
+    both, either = (geom == cube) & (truth == cube), (geom == cube) | (truth == cube)
+    assert np.mean(geom != truth) <= MAX_MISMATCH
+    assert both.sum() >= MIN_CUBE_IOU * either.sum() > 0
+
+
+@pytest.mark.parametrize("shadows", [False, True])
+@pytest.mark.parametrize(("name", "poses"), [("arm", POSES), ("primitives", 10)])
+def test_colours_match(
+    name: str, poses: int, shadows: bool, request: pytest.FixtureRequest
+) -> None:
+    scene: Scene = request.getfixturevalue(name)
+    size = (64, 64)
+    qposes = random_qpos(scene.mj_model, poses, seed=3)
+    render = jax.jit(jax.vmap(make_renderer(scene, size=size, shadows=shadows)))
+    packed = render(*geom_poses(scene.mj_model, qposes))
+    error = np.abs(np.asarray(rgb(packed), float) - _opengl_rgb(scene, qposes, size, shadows))
+    assert error.mean() < MAX_RGB_ERROR
+    if not shadows:
+        interior = _interior(np.asarray(segmentation(packed)))
+        assert error[interior].mean() < MAX_INTERIOR_ERROR
