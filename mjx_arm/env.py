@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_arm.config import EnvConfig, env_config
+from mjx_arm.kinematics import Poses
 from mjx_arm.physics import Physics, PhysicsState, make_physics
 from mjx_arm.render import make_renderer, rgb, segmentation
 from mjx_arm.render.renderer import Render, RenderWithDepth
@@ -84,6 +85,11 @@ class Env:
     physics: Physics
     starts: Starts
     render: Render | RenderWithDepth
+
+    def draw(self, poses: Poses) -> jax.Array:
+        """Packed pixels of a scene in these poses, `[H, W] uint32`."""
+        image = self.render(poses.geom_xpos, poses.geom_xmat)
+        return image[0] if isinstance(image, tuple) else image
 
     @property
     def num_actions(self) -> int:

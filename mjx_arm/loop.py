@@ -139,8 +139,7 @@ def _make_storage(config: TrainConfig, env: Env) -> _Storage:
     kinematics = make_kinematics(env.scene.mj_model)
 
     def draw(qpos: jax.Array) -> jax.Array:
-        poses = kinematics(qpos)
-        return env.render(poses.geom_xpos, poses.geom_xmat)
+        return env.draw(kinematics(qpos))
 
     return _Storage(store=lambda envs, obs: envs.env.physics.qpos, restore=jax.vmap(draw))
 
@@ -169,13 +168,13 @@ class _Body:
         )
         zero = jnp.zeros((config.num_envs,), jnp.float32)
         state = LoopState(
-            learner=self.dqn.init(learner_key, obs[:1]),
+            learner=self.dqn.init(learner_key, jax.tree.map(lambda x: x[:1], obs)),
             envs=envs,
             obs=obs,
             replay=init_replay(step, config.replay_slots),
             key=key,
             vector_step=jnp.zeros((), jnp.int32),
-            episode={name: zero for name in ("length", "return", "max_q", "regrasps", "held")},
+            episode=dict.fromkeys(("length", "return", "max_q", "regrasps", "held"), zero),
             counts={},
         )
         # One abstract step says which counts there are.
@@ -238,7 +237,7 @@ class _Body:
         def wait(learner: Learner) -> tuple[Learner, dict[str, jax.Array]]:
             zero = jnp.zeros((), jnp.float32)
             names = ("loss", "q_mean", "target_max")
-            return learner, {name: zero for name in names} | {"updates": jnp.zeros((), jnp.int32)}
+            return learner, dict.fromkeys(names, zero) | {"updates": jnp.zeros((), jnp.int32)}
 
         starts = max(config.learning_starts // config.num_envs, config.n_step + 1)
         return jax.lax.cond(replay.count > starts, learn, wait, learner)

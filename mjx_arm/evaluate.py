@@ -1,0 +1,176 @@
+"""Evaluation: a fixed number of episodes in every environment, all of them counted."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable
+from typing import Any
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mjx_arm.auto_reset import AutoReset, AutoResetState
+from mjx_arm.dqn import epsilon_greedy
+from mjx_arm.env import Env
+
+# Environments side by side, and iterations in one compiled call.
+_MAX_ENVS = 200
+_CHUNK = 100
+_WILSON_Z = 1.959964
+
+
+@dataclasses.dataclass(frozen=True)
+class Evaluation:
+    """What so many episodes came to.
+
+    Attributes:
+      episodes: all that were started.
+      successes: those that ended with the cube lifted.
+      rate: their share.
+      ci95: Wilson's interval of the share, 95 %.
+      mean_length: iterations of an episode, failures included.
+      grasp_rate: share of the episodes with at least one grasp.
+      regrasps: mean number of grasps after the first one, in an episode.
+    """
+
+    episodes: int
+    successes: int
+    rate: float
+    ci95: tuple[float, float]
+    mean_length: float
+    grasp_rate: float
+    regrasps: float
+
+
+@flax.struct.dataclass
+class _Run:
+    envs: AutoResetState
+    obs: Any
+    key: jax.Array
+    left: jax.Array
+    grasps: jax.Array
+    held: jax.Array
+    totals: dict[str, jax.Array]
+
+
+def evaluate(
+    env: Env,
+    apply: Callable[[Any, jax.Array], jax.Array],
+    params: Any,
+    *,
+    episodes: int,
+    epsilon: float,
+    seed: int,
+) -> Evaluation:
+    """Runs an epsilon-greedy policy for a number of episodes.
+
+    Each environment runs a number of episodes that is fixed beforehand, to their ends: the first
+    so many to finish would favour short ones, and with them successes.
+
+    Args:
+      env: made with the observation that the network wants.
+      apply: `(params, obs [N, ...]) -> Q-values [N, A]`.
+      params: of the network.
+      episodes: how many.
+      epsilon: share of random actions.
+      seed: of starts and random actions.
+
+    Raises:
+      ValueError: `episodes` below 1, or `epsilon` outside 0 to 1.
+    """
+    if episodes < 1:
+        raise ValueError(f"episodes is {episodes}: give at least 1")
+    if not 0.0 <= epsilon <= 1.0:
+        raise ValueError(f"epsilon is {epsilon}: give 0 to 1")
+    auto = AutoReset(env)
+    num_envs = min(episodes, _MAX_ENVS)
+
+    @jax.jit
+    def start(key: jax.Array) -> _Run:
+        reset_key, key = jax.random.split(key)
+        obs, envs = jax.vmap(auto.reset)(jax.random.split(reset_key, num_envs))
+        quota = np.full(num_envs, episodes // num_envs)
+        quota[: episodes % num_envs] += 1
+        zero = jnp.zeros((num_envs,), jnp.int32)
+        names = ("episodes", "successes", "length", "grasped", "regrasps")
+        return _Run(
+            envs=envs,
+            obs=obs,
+            key=key,
+            left=jnp.asarray(quota, jnp.int32),
+            grasps=zero,
+            held=jnp.zeros((num_envs,), jnp.bool_),
+            totals={name: jnp.zeros((), jnp.int32) for name in names},
+        )
+
+    @jax.jit
+    def advance(params: Any, run: _Run) -> _Run:
+        return jax.lax.fori_loop(
+            0, _CHUNK, lambda _, r: _step(auto, apply, params, epsilon, r), run
+        )
+
+    run = start(jax.random.key(seed))
+    while int(jnp.max(run.left)) > 0:
+        run = advance(params, run)
+    totals = {name: int(total) for name, total in run.totals.items()}
+    assert totals["episodes"] == episodes
+    return Evaluation(
+        episodes=episodes,
+        successes=totals["successes"],
+        rate=totals["successes"] / episodes,
+        ci95=wilson_interval(totals["successes"], episodes),
+        mean_length=totals["length"] / episodes,
+        grasp_rate=totals["grasped"] / episodes,
+        regrasps=totals["regrasps"] / episodes,
+    )
+
+
+def _step(
+    auto: AutoReset,
+    apply: Callable[[Any, jax.Array], jax.Array],
+    params: Any,
+    epsilon: float,
+    run: _Run,
+) -> _Run:
+    key, act_key, env_key = jax.random.split(run.key, 3)
+    action = epsilon_greedy(act_key, apply(params, run.obs), jnp.float32(epsilon))
+    keys = jax.random.split(env_key, len(run.left))
+    envs, transition = jax.vmap(auto.transition)(keys, run.envs, action)
+    counted = run.left > 0
+    ended = (transition.terminated | transition.truncated) & counted
+    held = transition.info["grasped"]
+    grasps = run.grasps + (held & ~run.held).astype(jnp.int32)
+    stepped = counted & ~transition.info["reset"]
+    counts = {
+        "episodes": ended,
+        "successes": ended & transition.terminated,
+        "length": stepped,
+        "grasped": ended & (grasps > 0),
+        "regrasps": jnp.where(ended, jnp.maximum(grasps - 1, 0), 0),
+    }
+    return _Run(
+        envs=envs,
+        obs=jax.vmap(auto.env.observe)(envs.env),
+        key=key,
+        left=run.left - ended.astype(jnp.int32),
+        grasps=jnp.where(ended, 0, grasps),
+        held=held & ~ended,
+        totals={
+            name: run.totals[name] + jnp.sum(count.astype(jnp.int32))
+            for name, count in counts.items()
+        },
+    )
+
+
+def wilson_interval(successes: int, episodes: int) -> tuple[float, float]:
+    """Wilson's 95 % score interval of a share (Wilson 1927): lower and upper bound."""
+    rate, z2 = successes / episodes, _WILSON_Z**2
+    centre = rate + z2 / (2 * episodes)
+    spread = math.sqrt(rate * (1 - rate) / episodes + z2 / (4 * episodes**2))
+    scale = 1 + z2 / episodes
+    low = (centre - _WILSON_Z * spread) / scale
+    high = (centre + _WILSON_Z * spread) / scale
+    return max(0.0, low), min(1.0, high)

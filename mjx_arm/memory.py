@@ -1,0 +1,52 @@
+"""What a training run will hold in memory, before it allocates it."""
+
+from __future__ import annotations
+
+import os
+from typing import Any
+
+import jax
+import numpy as np
+
+_FIELDS = ("learner", "envs", "obs", "replay")
+
+
+def memory_plan(state: Any) -> dict[str, int]:
+    """Bytes of each part of a `LoopState`, or of its shapes from `jax.eval_shape`."""
+    return {name: _size(getattr(state, name)) for name in _FIELDS}
+
+
+def check_memory(plan: dict[str, int]) -> None:
+    """Refuses a plan that cannot fit.
+
+    Raises:
+      ValueError: it needs more than the device, or on CPU the machine, has free.
+    """
+    needed, free = sum(plan.values()), free_memory()
+    if free is not None and needed > free:
+        raise ValueError(
+            f"the run needs {needed / 1e9:.2f} GB, of which the replay {plan['replay'] / 1e9:.2f} "
+            f"GB, and {free / 1e9:.2f} GB are free: give a smaller --replay-size or --num-envs"
+        )
+
+
+def free_memory() -> int | None:
+    """Bytes free on the default device, or on CPU in the machine; None where nobody says."""
+    device = jax.devices()[0]
+    if device.platform == "cpu":
+        try:
+            return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_AVPHYS_PAGES")
+        except (ValueError, OSError):
+            return None
+    stats = device.memory_stats()
+    return stats["bytes_limit"] - stats["bytes_in_use"] if stats else None
+
+
+def _size(tree: Any) -> int:
+    total = 0
+    for leaf in jax.tree.leaves(tree):
+        itemsize = (
+            4 if jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.extended) else leaf.dtype.itemsize
+        )
+        total += int(np.prod(leaf.shape)) * itemsize
+    return total
