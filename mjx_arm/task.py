@@ -14,8 +14,8 @@ NUM_ACTIONS = 2 * NUM_ARM_JOINTS + 2
 OPEN = 2 * NUM_ARM_JOINTS
 CLOSE = OPEN + 1
 
-# A pressing pad sinks about 0.1 mm into the cube, MuJoCo's contacts being soft.
-_TOUCH = 5e-4
+# A pad presses where it is inside the cube, contacts being soft; this much is rounding.
+_TOUCH = 1e-5
 
 
 def apply_action(ids: TaskIds, ctrl: jax.Array, action: jax.Array, degrees: float) -> jax.Array:
