@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
+
 import jax
 import jax.numpy as jnp
 import mujoco
-from mujoco import mjx
+
+# Without the extra `warp`, which the impl "jax" does without, the import prints what it misses.
+with contextlib.redirect_stdout(io.StringIO()):
+    from mujoco import mjx
 
 from mjx_arm.kinematics import make_kinematics
 from mjx_arm.physics.base import Physics, PhysicsState
