@@ -8,7 +8,8 @@ Distances are inverse depths: `w` is 1 / z-depth, in 1/m, and the nearest surfac
 From a fixed origin the plane of a face is crossed at a `w` that is affine in the screen
 coordinates, and a quadric at one that is affine plus the root of a quadratic. A convex body is hit
 where the last entry into its faces comes before the first exit: where the smallest `w` among the
-entries is at least the largest among the exits, and positive.
+entries is at least the largest among the exits. A `w` that is not positive is behind the camera:
+it needs no test here, since it is nearer than nothing.
 
 Shading travels as `lambert`, which is `w` times the cosine of incidence: that too is affine in `w`
 and the screen coordinates, so nothing is divided until the nearest geom is known.
@@ -37,8 +38,9 @@ class Hit(NamedTuple):
     """Where rays meet a primitive.
 
     Attributes:
-      hit: `[H, W] bool`; the others are meaningless where it is not set.
-      w: `[H, W] float32`, inverse depth, 1/m.
+      hit: `[H, W] bool`, whether the line of the ray enters the primitive; the others are
+        meaningless where it is not set.
+      w: `[H, W] float32`, inverse depth, 1/m; not positive where that is behind the camera.
       lambert: per light, `[H, W] float32`, `w` times the cosine of incidence, 1/m.
     """
 
@@ -136,7 +138,7 @@ def plane_hit(plane: Plane, rays: Rays) -> Hit:
     """Casts the rays at a plane."""
     w = affine(plane.w, rays.u, rays.v)
     x, y = (affine(form, rays.u, rays.v) for form in plane.offset)
-    hit = (w > 0) & (jnp.abs(x) <= plane.half[0] * w) & (jnp.abs(y) <= plane.half[1] * w)
+    hit = (jnp.abs(x) <= plane.half[0] * w) & (jnp.abs(y) <= plane.half[1] * w)
     return Hit(hit, w, tuple(w * cosine for cosine in plane.cosine))
 
 
@@ -171,7 +173,7 @@ def box_hit(box: Box, rays: Rays) -> Hit:
         leave = greater(leave, leave_axis)
         faces = zip(box.cosine[axis], cosines, strict=True)
         cosines = [jnp.where(later, this, other) for this, other in faces]
-    return Hit((w >= leave) & (w > 0), w, tuple(w * cosine for cosine in cosines))
+    return Hit(w >= leave, w, tuple(w * cosine for cosine in cosines))
 
 
 class Sphere(NamedTuple):
@@ -223,7 +225,7 @@ def sphere_hit(sphere: Sphere, rays: Rays) -> Hit:
         offset * w + sphere.curvature * direction
         for offset, direction in zip(sphere.offset, rays.to_light, strict=True)
     )
-    return Hit((root2 >= 0) & (towards > 0), w, lambert)
+    return Hit(root2 >= 0, w, lambert)
 
 
 class Tube(NamedTuple):
@@ -333,14 +335,14 @@ def cylinder_hit(cylinder: Cylinder, rays: Rays) -> Hit:
     on_side = (side.root2 >= 0) & (jnp.abs(rise) <= cylinder.reach * side.w)
     w_cap = cylinder.cap * axial
     run = tube.distance * w_cap + side.away
-    on_cap = (w_cap > 0) & (run * run + side.across2 <= tube.radius2 * (w_cap * w_cap))
+    on_cap = run * run + side.across2 <= tube.radius2 * (w_cap * w_cap)
     w = jnp.where(on_cap, w_cap, side.w)
     shading = zip(cylinder.offset, cylinder.direction, cylinder.cosine, strict=True)
     lambert = tuple(
         jnp.where(on_cap, cosine * w, offset * w + affine(form, rays.u, rays.v))
         for offset, form, cosine in shading
     )
-    return Hit(on_cap | (on_side & (w > 0)), w, lambert)
+    return Hit(on_cap | on_side, w, lambert)
 
 
 class Capsule(NamedTuple):
@@ -414,7 +416,7 @@ def capsule_hit(capsule: Capsule, rays: Rays) -> Hit:
     on_side = jnp.abs(rise) <= capsule.reach * side.w
     w_end, end_root2 = _capsule_end(capsule, rise + capsule.beyond > 0, axial, rays)
     w = jnp.where(on_side, side.w, w_end)
-    hit = (side.root2 >= 0) & (on_side | (end_root2 >= 0)) & (w > 0)
+    hit = (side.root2 >= 0) & (on_side | (end_root2 >= 0))
     # The normal points away from the nearest point of the axis.
     limit = capsule.half * w
     nearest = greater(lesser(capsule.height * w + axial, limit), -limit)

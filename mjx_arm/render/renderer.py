@@ -127,10 +127,12 @@ def make_renderer(
     """
     _validate_size(size)
     validate_geoms(scene.mj_model)
-    own = default_appearance(scene, camera)
-    plan = _make_plan(scene.mj_model, size, shadows)
     with jax.ensure_compile_time_eval():
-        background = jax.jit(functools.partial(_background, plan))(own)
+        own = default_appearance(scene, camera)
+        plan = _make_plan(scene.mj_model, size, shadows)
+    cast_background = jax.jit(functools.partial(_background, plan)).lower(own).compile()
+    with jax.ensure_compile_time_eval():
+        background = cast_background(own)
     draw = _packed_and_depth if depth else _packed
     return jax.jit(functools.partial(draw, plan, own, background))
 

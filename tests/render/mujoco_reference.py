@@ -17,7 +17,7 @@ def scene_of(xml: str) -> Scene:
     return Scene(name="test", mj_model=mujoco.MjModel.from_xml_string(xml))
 
 
-def random_primitives(seed: int, count: int = 16) -> Scene:
+def random_primitives(seed: int, count: int = 8) -> Scene:
     """Free bodies of all round and flat shapes over a floor, before a wall of finite size."""
     rng = np.random.default_rng(seed)
     bodies = []
@@ -105,24 +105,24 @@ def pixel_rays(mat: np.ndarray, fovy: float, size: tuple[int, int]) -> np.ndarra
 
 def cast_rays(
     model: mujoco.MjModel, data: mujoco.MjData, pos: np.ndarray, directions: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Geom ids, -1 for none, and distances in lengths of `directions`, by `mj_multiRay`."""
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Geom ids, -1 for none; distances in lengths of `directions`; normals; by `mj_multiRay`."""
     shape = directions.shape[:-1]
     length = np.linalg.norm(directions, axis=-1)
     unit = np.ascontiguousarray((directions / length[..., None]).reshape(-1))
     count = length.size
-    geom, distance = np.full(count, -1, np.int32), np.zeros(count)
+    geom, distance, normal = np.full(count, -1, np.int32), np.zeros(count), np.zeros(3 * count)
     mujoco.mj_multiRay(
-        model, data, pos, unit, SHOWN_GROUPS, 1, -1, geom, distance, None, count, _RAY_RANGE
+        model, data, pos, unit, SHOWN_GROUPS, 1, -1, geom, distance, normal, count, _RAY_RANGE
     )
-    distance = np.where(geom < 0, np.inf, distance)
-    return geom.reshape(shape), distance.reshape(shape) / length
+    distance = np.where(geom < 0, np.inf, distance).reshape(shape)
+    return geom.reshape(shape), distance / length, normal.reshape(*shape, 3)
 
 
 def cast_camera(
     model: mujoco.MjModel, data: mujoco.MjData, camera: str, size: tuple[int, int]
-) -> tuple[np.ndarray, np.ndarray]:
-    """Geom ids and z-depths `[H, W]` that a camera of the model sees."""
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Geom ids and z-depths `[H, W]` and normals `[H, W, 3]` that a camera of the model sees."""
     number = model.camera(camera).id
     directions = pixel_rays(data.cam_xmat[number], model.cam_fovy[number], size)
     return cast_rays(model, data, data.cam_xpos[number], directions)

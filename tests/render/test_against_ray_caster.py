@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from mujoco_reference import at, cast_camera, geom_poses, random_qpos
 
-from mjx_arm import make_renderer, segmentation
+from mjx_arm import make_renderer, rgb, segmentation
+from mjx_arm.render.geoms import geom_rgba
 from mjx_arm.scene import Scene
 
 POSES = 50
@@ -15,6 +16,8 @@ POSES = 50
 MAX_MISMATCH = 0.0002
 # Depths of about 1 m in float32, but for rays that graze a round body.
 MAX_DEPTH_P99 = 1e-4
+# Of 255: the geom's own colour is rounded, then the lit one; silhouettes bend away faster.
+MAX_LEVELS = 2.0
 
 
 @pytest.mark.parametrize("size", [(64, 64), (128, 128)])
@@ -29,13 +32,31 @@ def test_geom_ids_and_depths_match(
     packed, depth = render(*geom_poses(model, qposes))
     geom = np.asarray(segmentation(packed))
     truth = [cast_camera(model, at(model, qpos), "front", size) for qpos in qposes]
-    true_geom, true_depth = (np.stack(part) for part in zip(*truth, strict=True))
+    true_geom, true_depth, _ = (np.stack(part) for part in zip(*truth, strict=True))
 
     assert np.mean(geom != true_geom) <= MAX_MISMATCH
     agree = (geom == true_geom) & (geom >= 0)
     error = np.abs(np.asarray(depth) - true_depth)[agree]
     assert np.percentile(error, 99) < MAX_DEPTH_P99
     assert np.array_equal(np.isinf(depth), geom < 0)
+
+
+def test_shading_follows_the_normals(primitives: Scene) -> None:
+    model = primitives.mj_model
+    size = (64, 64)
+    qposes = random_qpos(model, 10, seed=4)
+    packed = jax.vmap(make_renderer(primitives, size=size))(*geom_poses(model, qposes))
+    states = [at(model, qpos) for qpos in qposes]
+    truth = [cast_camera(model, data, "front", size) for data in states]
+    geom, _, normal = (np.stack(part) for part in zip(*truth, strict=True))
+    headlight = model.vis.headlight
+    forward = -states[0].cam_xmat[0].reshape(3, 3)[:, 2]
+    light = headlight.ambient + np.zeros(normal.shape)
+    light += np.maximum(normal @ -states[0].light_xdir[0], 0)[..., None] * model.light_diffuse[0]
+    light += np.maximum(normal @ -forward, 0)[..., None] * headlight.diffuse
+    expected = 255 * np.minimum(geom_rgba(model)[geom, :3] * light, 1)
+    error = np.abs(np.asarray(rgb(packed)) - expected)[np.asarray(segmentation(packed)) == geom]
+    assert np.percentile(error, 99.9) < MAX_LEVELS
 
 
 @pytest.mark.parametrize("name", ["arm", "primitives"])
@@ -55,6 +76,6 @@ def test_a_wide_image_has_square_pixels(primitives: Scene) -> None:
     qpos = random_qpos(model, 1, seed=3)
     xpos, xmat = geom_poses(model, qpos)
     geom = np.asarray(segmentation(make_renderer(primitives, size=size)(xpos[0], xmat[0])))
-    true_geom, _ = cast_camera(model, at(model, qpos[0]), "front", size)
+    true_geom, _, _ = cast_camera(model, at(model, qpos[0]), "front", size)
     assert geom.shape == size
     assert np.mean(geom != true_geom) <= MAX_MISMATCH

@@ -23,10 +23,10 @@ def _levels(packed: jax.Array) -> np.ndarray:
 
 
 @pytest.mark.parametrize("shadows", [False, True])
-def test_the_models_own_appearance_changes_nothing(primitives: Scene, shadows: bool) -> None:
-    data = at(primitives.mj_model, random_qpos(primitives.mj_model, 1, seed=10)[0])
-    render = jax.jit(make_renderer(primitives, shadows=shadows))
-    own = render(data.geom_xpos, data.geom_xmat, default_appearance(primitives))
+def test_the_models_own_appearance_changes_nothing(arm: Scene, shadows: bool) -> None:
+    data = at(arm.mj_model, random_qpos(arm.mj_model, 1, seed=10)[0])
+    render = make_renderer(arm, shadows=shadows)
+    own = render(data.geom_xpos, data.geom_xmat, default_appearance(arm))
     cached = render(data.geom_xpos, data.geom_xmat)
     assert np.mean(np.abs(_levels(own) - _levels(cached)) > MAX_LEVELS) < 0.001
 

@@ -44,7 +44,7 @@ def _one_geom(shape: str, extra: str = "") -> Scene:
 
 
 def _look(
-    scene: Scene, pos: np.ndarray, mat: np.ndarray, shadows: bool = True
+    scene: Scene, pos: np.ndarray, mat: np.ndarray, shadows: bool = False
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Colours, geom ids and depths of N views from `pos [N, 3]` with axes `mat [N, 3, 3]`."""
     own = default_appearance(scene)
@@ -63,7 +63,7 @@ def _look(
 def _truth(scene: Scene, pos: np.ndarray, mat: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     data = at(scene.mj_model)
     views = [
-        cast_rays(scene.mj_model, data, np.float64(p), pixel_rays(m, FOVY, SIZE))
+        cast_rays(scene.mj_model, data, np.float64(p), pixel_rays(m, FOVY, SIZE))[:2]
         for p, m in zip(pos, mat, strict=True)
     ]
     geom, depth = zip(*views, strict=True)
@@ -133,13 +133,10 @@ def test_a_geom_around_the_camera_is_not_drawn(shape: str) -> None:
 
 
 @pytest.mark.parametrize("shape", SHAPES)
-@pytest.mark.parametrize("axis", [0, 1, 2])
-def test_camera_on_an_axis_of_symmetry(shape: str, axis: int) -> None:
+def test_camera_on_the_axes_of_symmetry(shape: str) -> None:
     scene = _one_geom(shape)
-    pos = np.zeros((2, 3))
-    pos[:, axis] = [0.7, -0.7]
-    mat = _looking_at(pos, np.zeros((2, 3)), np.random.default_rng(7))
-    _assert_same(scene, pos, mat)
+    pos = 0.7 * np.concatenate([np.eye(3), -np.eye(3)])
+    _assert_same(scene, pos, _looking_at(pos, np.zeros((6, 3)), np.random.default_rng(7)))
 
 
 @pytest.mark.parametrize("shape", ["box", "cylinder", "capsule", "plane"])
@@ -153,7 +150,7 @@ def test_grazing_rays(shape: str) -> None:
     target = np.asarray([[0.0, 0.0, top], [0.0, 0.0, -top], [side, 0.0, 0.0], [side, 0.0, 0.0]])
     pos, target = pos.astype(np.float32).astype(float), target.astype(np.float32).astype(float)
     mat = _looking_at(pos, target, np.random.default_rng(8))
-    colours, geom, depth = _look(scene, pos, mat)
+    colours, geom, depth = _look(scene, pos, mat, shadows=True)
     true_geom, true_depth = _truth(scene, pos, mat)
     # A face that is seen exactly edge-on may show in the pixels on its line.
     wrong = geom != true_geom
@@ -183,7 +180,7 @@ def test_a_floor_up_to_the_horizon() -> None:
 
 def test_an_empty_scene_is_black() -> None:
     scene = scene_of('<mujoco><worldbody><camera name="front"/></worldbody></mujoco>')
-    render = jax.jit(make_renderer(scene, shadows=True, depth=True))
+    render = make_renderer(scene, shadows=True, depth=True)
     packed, depth = render(jnp.zeros((0, 3)), jnp.zeros((0, 3, 3)))
     assert packed.shape == (64, 64)
     assert np.all(segmentation(packed) == -1)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -20,11 +21,11 @@ from mujoco_reference import (
     scene_of,
 )
 
-from mjx_arm import default_appearance, make_renderer, rgb
+from mjx_arm import Appearance, default_appearance, make_renderer, rgb
 from mjx_arm.scene import Scene
 
 SIZE = (64, 64)
-POSES = 4
+POSES = 2
 # Points on the border of a shadow, and on surfaces that the light grazes.
 MAX_MISMATCH = 0.001
 # Fewer levels of diffuse light than this are lost in rounding.
@@ -39,7 +40,7 @@ def _blocked(scene: Scene, data: mujoco.MjData) -> np.ndarray:
     camera = model.camera("front").id
     pos, to_light = data.cam_xpos[camera], -data.light_xdir[0]
     directions = pixel_rays(data.cam_xmat[camera], model.cam_fovy[camera], SIZE)
-    _, depth = cast_rays(model, data, pos, directions)
+    _, depth, _ = cast_rays(model, data, pos, directions)
     # Planes cast no shadow.
     bodies = copy.copy(model)
     bodies.geom_group[model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE] = 5
@@ -59,11 +60,12 @@ def test_shadows_fall_where_the_light_is_blocked(name: str, request: pytest.Fixt
     own = default_appearance(scene)
     unlit = dataclasses.replace(own, light_diffuse=jnp.zeros(3, jnp.float32))
 
-    def draw(shadows: bool, look: object) -> np.ndarray:
+    def drawing(shadows: bool) -> Callable[[Appearance], np.ndarray]:
         render = jax.vmap(make_renderer(scene, size=SIZE, shadows=shadows), in_axes=(0, 0, None))
-        return np.asarray(rgb(render(*poses, look))).astype(int)
+        return lambda look: np.asarray(rgb(render(*poses, look))).astype(int)
 
-    bright, shadowed, dark = draw(False, own), draw(True, own), draw(False, unlit)
+    plain = drawing(shadows=False)
+    bright, dark, shadowed = plain(own), plain(unlit), drawing(shadows=True)(own)
     diffuse = (bright - dark).max(axis=-1)
     blocked = np.stack([_blocked(scene, at(scene.mj_model, qpos)) for qpos in qposes])
     expected = np.where((blocked | (diffuse == 0))[..., None], dark, bright)
