@@ -37,7 +37,10 @@ def sign(x: jax.Array) -> jax.Array:
 
 
 def perpendicular(axis: jax.Array) -> jax.Array:
-    """Returns two unit vectors, `[2, 3]`, that complete the unit vector `axis [3]` to a basis."""
+    """Returns two unit vectors, `[2, 3]`, that complete the unit vector `axis [3]` to a basis.
+
+    Duff et al. 2017, Building an Orthonormal Basis, Revisited.
+    """
     x, y, z = axis
     s = sign(z)
     a = -1 / (s + z)
