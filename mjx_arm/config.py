@@ -239,6 +239,10 @@ class TrainConfig:
                 f"replay_size is {self.replay_size}: give more than n_step * num_envs = "
                 f"{self.n_step * self.num_envs}"
             )
+        if self.replay_slots > _MOST_SLOTS:
+            raise ValueError(
+                f"replay_size is {self.replay_size}: give at most {_MOST_SLOTS} * num_envs"
+            )
         if self.replay_size < self.batch_size:
             raise ValueError(
                 f"replay_size is {self.replay_size}: give at least batch_size = {self.batch_size}"
@@ -267,6 +271,9 @@ class TrainConfig:
             max_steps=self.max_steps,
         )
 
+
+# Slots are counted in 32 bits.
+_MOST_SLOTS = 2**30
 
 _COUNTS = (
     "num_envs",

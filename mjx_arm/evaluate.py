@@ -173,4 +173,5 @@ def wilson_interval(successes: int, episodes: int) -> tuple[float, float]:
     scale = 1 + z2 / episodes
     low = (centre - _WILSON_Z * spread) / scale
     high = (centre + _WILSON_Z * spread) / scale
-    return max(0.0, low), min(1.0, high)
+    # The two ends are exact where all or none succeeded, but for rounding.
+    return (0.0 if successes == 0 else low), (1.0 if successes == episodes else high)

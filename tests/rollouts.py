@@ -40,7 +40,7 @@ def random_policy(key: jax.Array, state: EnvState) -> jax.Array:
 
 
 def make_pushing_policy(scripted: Callable[[EnvState], jax.Array]) -> Policy:
-    """Goes for the cube, but opens, shuts and turns at random on the way, and so pushes it about."""
+    """Goes for the cube, but opens, shuts and turns at random on the way, which pushes it about."""
 
     def policy(key: jax.Array, state: EnvState) -> jax.Array:
         choose, which = jax.random.split(key)

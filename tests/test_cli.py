@@ -1,0 +1,137 @@
+from __future__ import annotations
+
+import json
+import pathlib
+import subprocess
+import sys
+
+import imageio.v3 as imageio
+import imageio_ffmpeg
+import jax
+import numpy as np
+import pytest
+
+from mjx_arm.agent import load_agent, load_config
+from mjx_arm.cli import main
+from mjx_arm.report.metrics import read_metrics
+
+TINY = [
+    *("--physics", "native", "--num-envs", "4", "--size", "16", "16", "--replay-size", "400"),
+    *("--batch-size", "8", "--learning-starts", "40", "--chunk-steps", "200"),
+    *("--total-steps", "400", "--max-steps", "25", "--hidden", "16", "--eval-episodes", "6"),
+]
+
+
+@pytest.fixture(scope="module")
+def run_folder(tmp_path_factory) -> pathlib.Path:
+    folder = tmp_path_factory.mktemp("run") / "tiny"
+    assert main([*TINY, "--out", str(folder)]) == 0
+    return folder
+
+
+def test_a_run_leaves_everything(run_folder):
+    names = {path.name for path in run_folder.iterdir()}
+    assert names == {
+        *("config.json", "metrics.jsonl", "tensorboard", "params", "evaluation.json"),
+        *("figure3.png", "learning.png", "policy.mp4"),
+    }
+    rows = read_metrics(run_folder)
+    assert [row["env_steps"] for row in rows] == [200, 400]
+    assert json.loads((run_folder / "evaluation.json").read_text())["episodes"] == 6
+    assert load_config(run_folder).total_steps == 400
+
+
+def read_video(path: pathlib.Path) -> np.ndarray:
+    """Frames of a video of 384 by 768; imageio's own reader leaves its pipes open."""
+    decode = [imageio_ffmpeg.get_ffmpeg_exe(), "-loglevel", "error", "-i", str(path)]
+    raw = [*decode, "-f", "rawvideo", "-pix_fmt", "rgb24", "-"]
+    frames = subprocess.run(raw, capture_output=True, check=True).stdout
+    return np.frombuffer(frames, np.uint8).reshape(-1, 384, 768, 3)
+
+
+def test_the_video_shows_the_scene_and_the_agents_view(run_folder):
+    frames = read_video(run_folder / "policy.mp4")
+    assert frames.shape == (26, 384, 768, 3)
+    for half in (frames[0, :, :384], frames[0, :, 384:]):
+        assert half.std() > 5
+
+
+def test_the_curves_are_pictures(run_folder):
+    for name in ("figure3.png", "learning.png"):
+        assert np.asarray(imageio.imread(run_folder / name)).std() > 5
+
+
+def test_the_agent_acts(run_folder):
+    agent = load_agent(run_folder)
+    obs, _ = agent.env.reset(jax.random.key(0))
+    assert 0 <= int(agent.act(obs, jax.random.key(0))) < 14
+    actions = {int(agent.act(obs, jax.random.key(k), epsilon=1.0)) for k in range(20)}
+    assert len(actions) > 3
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--env", "C"], "unknown environment 'C'"),
+        (["--physics", "bullet"], "unknown physics 'bullet'"),
+        (["--num-envs", "0"], "num_envs is 0"),
+        (["--num-envs", "-3"], "num_envs is -3"),
+        (["--batch-size", "0"], "batch_size is 0"),
+        (["--replay-size", "32"], "replay_size is 32"),
+        (["--replay-size", "100000000", "--storage", "pixels"], "give a smaller --replay-size"),
+        (["--replay-size", "1000000000000"], "replay_size is 1000000000000"),
+        (["--reward", "candy"], "unknown reward 'candy'"),
+        (["--scene", "kitchen"], "unknown scene 'kitchen'"),
+        (["--size", "0", "64"], "size is (0, 64)"),
+    ],
+)
+def test_bad_input_gets_one_sentence_and_status_2(arguments, message, capsys, tmp_path):
+    folder = tmp_path / "run"
+    assert main([*arguments, "--out", str(folder)]) == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") == 1
+    assert not folder.exists()
+
+
+def test_an_unknown_option_gets_status_2(capsys):
+    with pytest.raises(SystemExit) as exit_info:
+        main(["--colour", "red"])
+    assert exit_info.value.code == 2
+    assert "--colour" in capsys.readouterr().err
+
+
+def test_warp_without_its_extra_is_refused(capsys, tmp_path):
+    if "warp" in sys.modules or __import__("importlib.util").util.find_spec("warp"):
+        pytest.skip("the extra `warp` is installed")
+    assert main(["--physics", "mjx-warp", "--out", str(tmp_path / "run")]) == 2
+    assert "extra 'warp'" in capsys.readouterr().err
+
+
+def test_an_output_folder_that_cannot_be_one_is_refused(capsys, tmp_path):
+    file = tmp_path / "file"
+    file.write_text("")
+    full = tmp_path / "full"
+    full.mkdir()
+    (full / "thesis.tex").write_text("")
+    for folder, message in ((file, "is a file"), (full, "is not empty")):
+        assert main([*TINY, "--out", str(folder)]) == 2
+        assert message in capsys.readouterr().err
+    assert [path.name for path in full.iterdir()] == ["thesis.tex"]
+
+
+@pytest.mark.parametrize("present", [False, True])
+def test_an_unused_nvidia_card_is_pointed_out(present, monkeypatch, capsys, tmp_path):
+    from rich.console import Console
+
+    from mjx_arm.report import progress
+
+    if jax.default_backend() != "cpu":
+        pytest.skip("jax already uses an accelerator")
+    if present:
+        card = tmp_path / "nvidia-smi"
+        card.write_text("#!/bin/sh\n")
+        card.chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    progress.say_device(Console(width=200))
+    assert ("make setup GPU=cuda13" in capsys.readouterr().out) == present

@@ -1,0 +1,130 @@
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+
+from mjx_arm.dqn import DQN, epsilon_greedy, half_square, huber, td_error, td_target
+from mjx_arm.replay import Step, add, init_replay, sample
+
+GAMMA = 0.9
+
+
+def test_target_and_error_by_hand():
+    next_q, chooser = jnp.asarray([1.0, 5.0, 3.0]), jnp.asarray([0.0, 1.0, 2.0])
+    assert td_target(jnp.float32(2.0), jnp.float32(0.5), next_q, next_q) == 4.5
+    assert td_target(jnp.float32(2.0), jnp.float32(0.5), next_q, chooser) == 3.5
+    assert td_target(jnp.float32(2.0), jnp.float32(0.0), next_q, chooser) == 2.0
+    assert td_error(jnp.asarray([7.0, 8.0]), jnp.int32(1), jnp.float32(3.0)) == 5.0
+
+
+@pytest.mark.parametrize(
+    ("error", "expected", "square"), [(0.5, 0.125, 0.125), (-1.0, 0.5, 0.5), (3.0, 2.5, 4.5)]
+)
+def test_losses_by_hand(error, expected, square):
+    assert huber(jnp.float32(error)) == pytest.approx(expected)
+    assert half_square(jnp.float32(error)) == pytest.approx(square)
+
+
+def test_ranks_are_asserted():
+    with pytest.raises(AssertionError):
+        td_target(jnp.zeros(2), jnp.zeros(()), jnp.zeros(3), jnp.zeros(3))
+
+
+def test_epsilon_is_the_share_of_random_actions():
+    q = jnp.tile(jnp.asarray([0.0, 1.0, 0.0, 0.0]), (20_000, 1))
+    for epsilon in (0.0, 0.4, 1.0):
+        actions = np.asarray(epsilon_greedy(jax.random.key(0), q, jnp.float32(epsilon)))
+        assert (actions != 1).mean() == pytest.approx(0.75 * epsilon, abs=0.02)
+
+
+def make_tabular(polyak=0.0, target_period=20, double=True) -> DQN:
+    """Q-values of two observations, 0 and 1, and two actions, from a table."""
+
+    def apply(params, obs):
+        return params[obs.astype(jnp.int32)]
+
+    return DQN(
+        apply=apply,
+        init_params=lambda key, obs: 0.1 * jax.random.normal(key, (2, 2)),
+        optimizer=optax.adam(0.05),
+        double=double,
+        huber=True,
+        polyak=polyak,
+        target_period=target_period,
+    )
+
+
+def probe(transition, *, n_step: int, dqn: DQN, length: int = 100) -> np.ndarray:
+    """Learns the Q-values of a probe: `transition(obs, action) -> next, reward, end, cut`."""
+    rng = np.random.default_rng(0)
+    obs, over, replay = 0, False, None
+    for _ in range(length):
+        action = int(rng.integers(2))
+        if over:
+            after, reward, end, cut, void = 0, 0.0, False, False, True
+        else:
+            (after, reward, end, cut), void = transition(obs, action), False
+        step = Step(
+            frame=jnp.asarray([obs], jnp.float32),
+            action=jnp.asarray([action], jnp.uint8),
+            reward=jnp.asarray([reward], jnp.float32),
+            terminated=jnp.asarray([end]),
+            truncated=jnp.asarray([cut]),
+            void=jnp.asarray([void]),
+        )
+        # 64 slots hold less than was written, so that the ring has wrapped around.
+        replay = add(init_replay(step, 64) if replay is None else replay, step)
+        obs, over = after, end or cut
+
+    def learn(learner, key):
+        batch = sample(replay, key, 32, n_step, GAMMA)
+        return dqn.update(learner, batch, batch.frame, batch.next_frame)
+
+    learner = dqn.init(jax.random.key(0), jnp.zeros(1))
+    keys = jax.random.split(jax.random.key(1), 2000)
+    learner, _ = jax.jit(lambda s, k: jax.lax.scan(learn, s, k))(learner, keys)
+    return np.asarray(learner.params)
+
+
+DQNS = {
+    "copies": make_tabular(),
+    "polyak": make_tabular(polyak=0.05),
+    "single": make_tabular(double=False),
+}
+
+
+@pytest.mark.parametrize("dqn", DQNS.values(), ids=DQNS.keys())
+@pytest.mark.parametrize("n_step", [1, 3])
+class TestProbes:
+    """Environments with known Q-values, each one notch harder."""
+
+    def test_constant_reward(self, dqn, n_step):
+        q = probe(lambda obs, action: (0, 1.0, True, False), n_step=n_step, dqn=dqn)
+        np.testing.assert_allclose(q[0], [1.0, 1.0], atol=0.02)
+
+    def test_reward_by_observation(self, dqn, n_step):
+        def transition(obs, action):
+            return (1, -1.0, False, False) if obs == 0 else (0, 2.0, True, False)
+
+        q = probe(transition, n_step=n_step, dqn=dqn)
+        np.testing.assert_allclose(q, [[-1.0 + 2 * GAMMA] * 2, [2.0, 2.0]], atol=0.04)
+
+    def test_delayed_reward(self, dqn, n_step):
+        def transition(obs, action):
+            return (1, 0.0, False, False) if obs == 0 else (0, 1.0, True, False)
+
+        q = probe(transition, n_step=n_step, dqn=dqn)
+        np.testing.assert_allclose(q, [[GAMMA, GAMMA], [1.0, 1.0]], atol=0.03)
+
+    def test_reward_by_action(self, dqn, n_step):
+        q = probe(
+            lambda obs, action: (0, 1.0 if action else -1.0, True, False), n_step=n_step, dqn=dqn
+        )
+        np.testing.assert_allclose(q[0], [-1.0, 1.0], atol=0.03)
+
+    def test_truncation_bootstraps_for_ever(self, dqn, n_step):
+        q = probe(lambda obs, action: (0, 1.0, False, True), n_step=n_step, dqn=dqn)
+        np.testing.assert_allclose(q[0], [10.0, 10.0], atol=0.5)

@@ -1,0 +1,70 @@
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import mjx_arm
+from mjx_arm.evaluate import evaluate, wilson_interval
+from mjx_arm.task import NUM_ACTIONS, OPEN
+
+EPISODES = 1000
+# The waist is uniform within 20 degrees; beyond 10 the fake policy lifts.
+RATE = 0.25
+THRESHOLD = np.deg2rad(10.0)
+SHOULDER_UP = 2
+
+
+def fake_policy(params, obs):
+    """Lifts the cube, within about 30 steps, or drops it and waits for the truncation."""
+    del params
+    action = jnp.where(obs[:, 0] > THRESHOLD, SHOULDER_UP, OPEN)
+    return jax.nn.one_hot(action, NUM_ACTIONS)
+
+
+@pytest.fixture(scope="module")
+def env():
+    return mjx_arm.make(
+        "B", physics="native", observation="state", start="in_grasp", lift=0.1, max_steps=120
+    )
+
+
+def test_a_policy_of_known_rate_gets_its_rate(env):
+    result = evaluate(env, fake_policy, None, episodes=EPISODES, epsilon=0.0, seed=3)
+    assert result.episodes == EPISODES
+    assert result.rate == result.successes / EPISODES
+    # Four standard errors. Successes take a third as long as failures, so that the first thousand
+    # episodes to finish would show about one half.
+    assert result.rate == pytest.approx(RATE, abs=4 * np.sqrt(RATE * (1 - RATE) / EPISODES))
+    assert result.ci95[0] < RATE < result.ci95[1]
+    # Who opens at once never holds the cube.
+    assert result.grasp_rate == result.rate
+    assert 60 < result.mean_length < 120
+
+
+def test_every_episode_counts_when_they_do_not_divide_evenly(env):
+    result = evaluate(env, fake_policy, None, episodes=207, epsilon=0.0, seed=3)
+    assert result.episodes == 207
+
+
+def test_two_seeds_give_two_results(env):
+    results = [
+        evaluate(env, fake_policy, None, episodes=20, epsilon=0.5, seed=seed) for seed in (1, 1, 2)
+    ]
+    assert results[0] == results[1]
+    assert results[0] != results[2]
+
+
+def test_wilson_interval_by_hand():
+    # 8 of 10, from Wilson's formula worked out by hand.
+    assert wilson_interval(8, 10) == pytest.approx((0.4902, 0.9433), abs=1e-4)
+    assert wilson_interval(0, 10)[0] == 0.0
+    assert wilson_interval(10, 10)[1] == 1.0
+
+
+@pytest.mark.parametrize(("option", "value"), [("episodes", 0), ("epsilon", 1.5)])
+def test_bad_options_are_refused(env, option, value):
+    options = {"episodes": 1, "epsilon": 0.1, option: value}
+    with pytest.raises(ValueError, match=option):
+        evaluate(env, fake_policy, None, seed=0, **options)
