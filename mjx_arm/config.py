@@ -194,8 +194,8 @@ class TrainConfig:
     reward_scale: float = 0.2
     max_steps: int = 1000
     seed: int = 0
-    num_envs: int = 32
-    total_steps: int = 1_500_000
+    num_envs: int = 64
+    total_steps: int = 2_000_000
     storage: str = "states"
     replay_size: int = 200_000
     batch_size: int = 64

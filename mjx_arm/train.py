@@ -13,7 +13,7 @@ from rich.console import Console
 from mjx_arm.agent import load_agent, save_agent_params, save_config
 from mjx_arm.config import TrainConfig
 from mjx_arm.evaluate import Evaluation, evaluate
-from mjx_arm.loop import LoopState, Trainer, make_trainer, summarise
+from mjx_arm.loop import Trainer, make_trainer, summarise
 from mjx_arm.memory import check_memory, memory_plan
 from mjx_arm.report.figures import plot_curves
 from mjx_arm.report.metrics import MetricsWriter
@@ -23,6 +23,8 @@ from mjx_arm.report.video import draw_episode, record_episode, write_video
 # Held out: training draws its keys from the run's own seed.
 _EVALUATION_SEED = 1_000_003
 _EVALUATION_EPSILON = 0.1
+# Chunks between two checkpoints of the parameters.
+_SAVE_EVERY = 10
 
 
 def train(
@@ -49,14 +51,13 @@ def train(
     check_memory(plan)
     prepare_folder(folder)
     save_config(folder, config)
-    state = _run(trainer, folder, console)
-    save_agent_params(folder, state.learner.params)
+    _run(trainer, folder, console)
     for path in plot_curves(folder):
         console.print(f"curves: {path}")
     return _show_agent(folder, eval_episodes, console)
 
 
-def _run(trainer: Trainer, folder: pathlib.Path, console: Console) -> LoopState:
+def _run(trainer: Trainer, folder: pathlib.Path, console: Console) -> None:
     config = trainer.config
     state = trainer.init(jax.random.key(config.seed))
     per_chunk = config.chunk_length * config.num_envs
@@ -71,7 +72,8 @@ def _run(trainer: Trainer, folder: pathlib.Path, console: Console) -> LoopState:
             metrics["steps_per_s"] = per_chunk / (time.perf_counter() - started)
             writer.write(metrics)
             progress.update(task, completed=chunk * per_chunk, metrics=describe(metrics))
-    return state
+            if chunk == chunks or chunk % _SAVE_EVERY == 0:
+                save_agent_params(folder, state.learner.params)
 
 
 def _show_agent(folder: pathlib.Path, episodes: int, console: Console) -> Evaluation:
