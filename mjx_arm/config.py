@@ -214,7 +214,7 @@ class TrainConfig:
     epsilon_end: float = 0.1
     epsilon_steps: int = 100_000
     widths: tuple[int, int, int] = (16, 32, 32)
-    kernels: tuple[int, int, int] = (5, 3, 3)
+    kernels: tuple[int, int, int] = (4, 3, 3)
     strides: tuple[int, int, int] = (2, 1, 1)
     hidden: int = 256
     chunk_steps: int = 16_384

@@ -51,22 +51,37 @@ class PatchConv(nn.Module):
             jnp.float32,
         )
         bias = self.param("bias", nn.initializers.zeros, (self.features,), jnp.float32)
+        blocks = -(-self.kernel // self.stride)
         rows = patches(x, self.kernel, self.stride)
-        return rows @ weights.reshape(-1, self.features) + bias
+        # The kernel, padded to whole blocks, in the order of the patches: block, then pixel in it.
+        spare = blocks * self.stride - self.kernel
+        weights = jnp.pad(weights, ((0, spare), (0, spare), (0, 0), (0, 0)))
+        weights = weights.reshape(blocks, self.stride, blocks, self.stride, -1, self.features)
+        weights = weights.transpose(0, 2, 1, 3, 4, 5).reshape(-1, self.features)
+        return rows @ weights + bias
 
 
 def patches(x: jax.Array, kernel: int, stride: int) -> jax.Array:
-    """Patches of a padded image: `[B, H, W, C]` to `[B, H', W', kernel * kernel * C]`."""
-    height, width = (-(-size // stride) for size in x.shape[1:3])
-    pads = []
-    for size, count in zip(x.shape[1:3], (height, width), strict=True):
-        total = max((count - 1) * stride + kernel - size, 0)
-        pads.append((total // 2, total - total // 2))
-    x = jnp.pad(x, ((0, 0), *pads, (0, 0)))
+    """Patches of an image padded as by "SAME": `[B, H, W, C]` to `[B, H', W', P]`.
+
+    The image is cut into blocks of `stride` pixels first, so that a patch is a few long runs of
+    memory instead of many short ones; `P` is `C` times the pixels of the blocks that hold a kernel.
+    """
+    batch, _, _, channels = x.shape
+    blocks = -(-kernel // stride)
+    pads, counts = [], []
+    for size in x.shape[1:3]:
+        count = -(-size // stride)
+        before = max((count - 1) * stride + kernel - size, 0) // 2
+        pads.append((before, (count - 1 + blocks) * stride - size - before, 0))
+        counts.append(count)
+    # lax.pad, because the far end may lose pixels that no kernel reaches.
+    x = jax.lax.pad(x, jnp.zeros((), x.dtype), ((0, 0, 0), *pads, (0, 0, 0)))
+    height, width = (count - 1 + blocks for count in counts)
+    x = x.reshape(batch, height, stride, width, stride, channels).transpose(0, 1, 3, 2, 4, 5)
+    x = x.reshape(batch, height, width, stride * stride * channels)
     rows = [
-        x[:, i : i + (height - 1) * stride + 1 : stride, j : j + (width - 1) * stride + 1 : stride]
-        for i in range(kernel)
-        for j in range(kernel)
+        x[:, i : i + counts[0], j : j + counts[1]] for i in range(blocks) for j in range(blocks)
     ]
     return jnp.concatenate(rows, axis=-1)
 
