@@ -26,7 +26,7 @@ class Agent:
 
     Attributes:
       config: of the run that trained it.
-      env: the environment that it was trained in.
+      env: the environment to try it in.
       dqn: the algorithm, with the network.
       params: of the network.
     """
@@ -78,7 +78,9 @@ def save_agent_params(folder: pathlib.Path, params: Any) -> None:
 
 
 def load_agent(folder: str | pathlib.Path, **options: Any) -> Agent:
-    """Reads a trained agent.
+    """Reads a trained agent, with the environment to try it in.
+
+    In environment B that is one where the cube moves after every episode, failed ones included.
 
     Args:
       folder: a run folder.
@@ -89,7 +91,9 @@ def load_agent(folder: str | pathlib.Path, **options: Any) -> Agent:
     """
     folder = pathlib.Path(folder)
     config = dataclasses.replace(load_config(folder), **options)
-    env = make_env(config.env_config())
+    trained_in = config.env_config()
+    moves = trained_in.cube_moves if trained_in.cube_moves == "never" else "always"
+    env = make_env(dataclasses.replace(trained_in, cube_moves=moves))
     dqn = make_dqn(config, env)
 
     def init() -> Any:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import datetime
+import json
 import pathlib
 import sys
 from collections.abc import Sequence
@@ -12,12 +13,16 @@ from typing import Annotated
 import tyro
 from rich.console import Console
 
+from mjx_arm.agent import Agent, load_agent, load_config
 from mjx_arm.config import TrainConfig
+from mjx_arm.evaluate import evaluate
+from mjx_arm.report.figures import plot_curves
+from mjx_arm.report.video import draw_episode, record_episode, write_video
 from mjx_arm.train import train
 
 
 @dataclasses.dataclass(frozen=True)
-class TrainCommand:
+class Train:
     """Train an arm from pixels to grasp a cube and lift it.
 
     Attributes:
@@ -30,24 +35,114 @@ class TrainCommand:
     out: pathlib.Path | None = None
     eval_episodes: int = 200
 
+    def run(self) -> None:
+        """Runs the command."""
+        now = datetime.datetime.now().strftime("%Y-%m-%d-%H%M%S")
+        folder = self.out or pathlib.Path("runs") / f"{now}-{self.config.env}"
+        console = Console(highlight=False)
+        train(self.config, folder, eval_episodes=self.eval_episodes, console=console)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Try:
+    """What the commands that try an agent have in common.
+
+    Attributes:
+      agent: a run folder.
+      env: environment, `A` or `B`; by default the one it was trained in.
+      physics: backend; by default that of the run.
+      epsilon: share of random actions.
+      seed: of starts and random actions.
+    """
+
+    agent: tyro.conf.Positional[pathlib.Path]
+    env: str | None = None
+    physics: str | None = None
+    epsilon: float = 0.1
+    seed: int = 7
+
+    def load(self) -> Agent:
+        config = load_config(self.agent)
+        env, physics = self.env or config.env, self.physics or config.physics
+        return load_agent(self.agent, env=env, physics=physics)
+
+
+@dataclasses.dataclass(frozen=True)
+class Eval(_Try):
+    """Try an agent for a number of episodes, and print how many succeeded.
+
+    Attributes:
+      episodes: how many.
+      json: print one JSON object.
+    """
+
+    episodes: int = 1000
+    json: bool = False
+
+    def run(self) -> None:
+        """Runs the command."""
+        agent = self.load()
+        result = evaluate(
+            agent.env,
+            agent.dqn.apply,
+            agent.params,
+            episodes=self.episodes,
+            epsilon=self.epsilon,
+            seed=self.seed,
+        )
+        report = dataclasses.asdict(result)
+        if self.json:
+            print(json.dumps(report))
+            return
+        for name, value in report.items():
+            print(f"{name:<12} {value}")
+
+
+@dataclasses.dataclass(frozen=True)
+class Play(_Try):
+    """Record one episode of an agent as a video.
+
+    Attributes:
+      out: the video, ending in `.mp4` or `.gif`.
+    """
+
+    out: pathlib.Path = pathlib.Path("video.mp4")
+
+    def run(self) -> None:
+        """Runs the command."""
+        agent = self.load()
+        episode = record_episode(
+            agent.env, agent.dqn.apply, agent.params, epsilon=self.epsilon, seed=self.seed
+        )
+        write_video(self.out, draw_episode(agent.env, episode))
+        print(f"{self.out}: {len(episode.qpos)} frames, success: {episode.success}")
+
+
+@dataclasses.dataclass(frozen=True)
+class Figures:
+    """Draw the curves of a run again.
+
+    Attributes:
+      folder: a run folder.
+    """
+
+    folder: tyro.conf.Positional[pathlib.Path]
+
+    def run(self) -> None:
+        """Runs the command."""
+        for path in plot_curves(self.folder):
+            print(path)
+
+
+Command = Train | Eval | Play | Figures
+
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the command line; returns the exit status: 2 for input that does not fit."""
     try:
-        command = tyro.cli(TrainCommand, args=arguments, prog="train.py")
-        _train(command)
+        command: Command = tyro.cli(Command, args=arguments, prog="mjx-arm")
+        command.run()
     except ValueError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
     return 0
-
-
-def _train(command: TrainCommand) -> None:
-    now = datetime.datetime.now().strftime("%Y-%m-%d-%H%M%S")
-    folder = command.out or pathlib.Path("runs") / f"{now}-{command.config.env}"
-    train(
-        command.config,
-        folder,
-        eval_episodes=command.eval_episodes,
-        console=Console(highlight=False),
-    )

@@ -188,4 +188,5 @@ def _vector(values: np.ndarray) -> _Vector:
 
 
 def _stack(values: list[_Vector] | list[_Matrix]) -> jax.Array:
-    return jnp.stack([jnp.asarray(x, jnp.float32) for x in jax.tree.leaves(values)])
+    leaves = [jnp.asarray(x, jnp.float32) for x in jax.tree.leaves(values)]
+    return jnp.stack(leaves) if leaves else jnp.zeros((0,), jnp.float32)

@@ -25,7 +25,7 @@ TINY = [
 @pytest.fixture(scope="module")
 def run_folder(tmp_path_factory) -> pathlib.Path:
     folder = tmp_path_factory.mktemp("run") / "tiny"
-    assert main([*TINY, "--out", str(folder)]) == 0
+    assert main(["train", *TINY, "--out", str(folder)]) == 0
     return folder
 
 
@@ -87,7 +87,7 @@ def test_the_agent_acts(run_folder):
 )
 def test_bad_input_gets_one_sentence_and_status_2(arguments, message, capsys, tmp_path):
     folder = tmp_path / "run"
-    assert main([*arguments, "--out", str(folder)]) == 2
+    assert main(["train", *arguments, "--out", str(folder)]) == 2
     error = capsys.readouterr().err
     assert message in error
     assert error.count("\n") == 1
@@ -96,7 +96,7 @@ def test_bad_input_gets_one_sentence_and_status_2(arguments, message, capsys, tm
 
 def test_an_unknown_option_gets_status_2(capsys):
     with pytest.raises(SystemExit) as exit_info:
-        main(["--colour", "red"])
+        main(["train", "--colour", "red"])
     assert exit_info.value.code == 2
     assert "--colour" in capsys.readouterr().err
 
@@ -104,7 +104,7 @@ def test_an_unknown_option_gets_status_2(capsys):
 def test_warp_without_its_extra_is_refused(capsys, tmp_path):
     if "warp" in sys.modules or __import__("importlib.util").util.find_spec("warp"):
         pytest.skip("the extra `warp` is installed")
-    assert main(["--physics", "mjx-warp", "--out", str(tmp_path / "run")]) == 2
+    assert main(["train", "--physics", "mjx-warp", "--out", str(tmp_path / "run")]) == 2
     assert "extra 'warp'" in capsys.readouterr().err
 
 
@@ -115,7 +115,7 @@ def test_an_output_folder_that_cannot_be_one_is_refused(capsys, tmp_path):
     full.mkdir()
     (full / "thesis.tex").write_text("")
     for folder, message in ((file, "is a file"), (full, "is not empty")):
-        assert main([*TINY, "--out", str(folder)]) == 2
+        assert main(["train", *TINY, "--out", str(folder)]) == 2
         assert message in capsys.readouterr().err
     assert [path.name for path in full.iterdir()] == ["thesis.tex"]
 
@@ -135,3 +135,34 @@ def test_an_unused_nvidia_card_is_pointed_out(present, monkeypatch, capsys, tmp_
     monkeypatch.setenv("PATH", str(tmp_path))
     progress.say_device(Console(width=200))
     assert ("make setup GPU=cuda13" in capsys.readouterr().out) == present
+
+
+def test_eval_prints_json(run_folder, capsys):
+    assert main(["eval", str(run_folder), "--episodes", "5", "--env", "B", "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["episodes"] == 5
+    assert set(report) == {
+        *("episodes", "successes", "rate", "ci95", "mean_length", "grasp_rate", "regrasps"),
+    }
+
+
+def test_play_writes_a_gif(run_folder, tmp_path, capsys):
+    path = tmp_path / "policy.gif"
+    assert main(["play", str(run_folder), "--out", str(path)]) == 0
+    assert imageio.imread(path, index=0).shape == (384, 768, 3)
+    assert "26 frames" in capsys.readouterr().out
+
+
+def test_figures_draws_the_curves_again(run_folder, capsys):
+    (run_folder / "learning.png").unlink()
+    assert main(["figures", str(run_folder)]) == 0
+    assert (run_folder / "learning.png").is_file()
+    assert "learning.png" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("command", ["eval", "play", "figures"])
+def test_what_is_no_run_is_refused(command, tmp_path, capsys):
+    assert main([command, str(tmp_path / "nothing")]) == 2
+    error = capsys.readouterr().err
+    assert "is no run folder" in error
+    assert error.count("\n") == 1

@@ -50,7 +50,9 @@ def make_mjx(mj_model: mujoco.MjModel, substeps: int, impl: str = "jax") -> Phys
         data = template.replace(
             qpos=state.qpos, qvel=state.qvel, ctrl=ctrl, qacc_warmstart=state.integration
         )
-        data = jax.lax.fori_loop(0, substeps, lambda _, d: mjx.step(model, d), data)
+        # MJX mixes dtypes, which a caller's own strictness must not be held against.
+        with jax.numpy_dtype_promotion("standard"):
+            data = jax.lax.fori_loop(0, substeps, lambda _, d: mjx.step(model, d), data)
         after = (data.qpos, data.qvel, data.qacc_warmstart)
         sane = [jnp.all(jnp.abs(x) < _MAX_VALUE) for x in after]
         diverged = ~(sane[0] & sane[1] & sane[2])

@@ -203,11 +203,13 @@ def _call_host(
         return out
 
     how = "broadcast_all"
-    return jax.lax.platform_dependent(
+    returned = jax.lax.platform_dependent(
         rows,
         cpu=buffer_callback(in_place, result, vmap_method=how),
         default=lambda rows: jax.pure_callback(copied, result, rows, vmap_method=how),
     )
+    # A callback forgets over which axes of a mesh its operands vary, which `shard_map` checks.
+    return returned | (rows[0] & jnp.uint32(0))
 
 
 def _step_rows(

@@ -103,5 +103,7 @@ def write_video(path: pathlib.Path, frames: np.ndarray) -> None:
     os.environ.setdefault("IMAGEIO_FFMPEG_NO_PREVENT_SIGINT", "1")
     import imageio.v2 as imageio
 
-    options: dict[str, Any] = {"loop": 0} if path.suffix == ".gif" else {"macro_block_size": 16}
-    imageio.mimsave(path, list(frames), fps=_FRAMES_PER_SECOND, **options)
+    options: dict[str, Any] = {"fps": _FRAMES_PER_SECOND, "macro_block_size": 16}
+    if path.suffix == ".gif":
+        options = {"duration": 1000 / _FRAMES_PER_SECOND, "loop": 0}
+    imageio.mimsave(path, list(frames), **options)
