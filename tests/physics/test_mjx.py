@@ -1,0 +1,89 @@
+from __future__ import annotations
+
+import importlib.util
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from physics_lab import scan_of
+
+from mjx_arm.physics import make_physics
+
+WITHOUT_WARP = importlib.util.find_spec("warp") is None
+
+MANY = """
+import sys
+import jax, jax.numpy as jnp, numpy as np
+from mjx_arm.physics import make_physics
+from mjx_arm.scene import load_scene, resolve_task
+
+envs = 256 * jax.device_count()
+scene = load_scene("arm_cube")
+ids, physics = resolve_task(scene), make_physics(scene, "mjx")
+qpos = jnp.asarray(np.tile(ids.home_qpos, (envs, 1)))
+ctrl = jnp.asarray(np.tile(ids.home_ctrl, (envs, 1)))
+
+def run(state, ctrl):
+    step = lambda state, _: (jax.vmap(physics.step)(state, ctrl), None)
+    return jax.lax.scan(step, state, None, length=50)[0]
+
+state = jax.vmap(physics.init)(qpos, ctrl)
+if jax.device_count() > 1:
+    mesh = jax.make_mesh((jax.device_count(),), ("env",))
+    spec = jax.sharding.PartitionSpec("env")
+    state, ctrl = jax.device_put((state, ctrl), jax.NamedSharding(mesh, spec))
+    run = jax.shard_map(run, mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False)
+print(bool(jnp.isfinite(jax.jit(run)(state, ctrl).qpos).all()))
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("devices", [1, 2])
+def test_many_environments_on_cpu_come_to_an_end(devices, monkeypatch):
+    # A batched Cholesky on XLA's CPU blocks a thread of the pool that its own pieces wait for, so
+    # two at a time hang for ever: 256 environments did with `implicitfast`, which has a second one.
+    monkeypatch.setenv("JAX_PLATFORMS", "cpu")
+    monkeypatch.setenv("XLA_FLAGS", f"--xla_force_host_platform_device_count={devices}")
+    done = subprocess.run(
+        [sys.executable, "-c", MANY], capture_output=True, text=True, timeout=900, check=False
+    )
+    assert done.stdout.strip() == "True", done.stderr
+
+
+def test_the_scene_gives_mjx_no_second_cholesky(scene):
+    model = scene.mj_model
+    assert model.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER
+    assert model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_EULERDAMP
+
+
+def test_importing_mjx_prints_nothing():
+    code = "import mjx_arm.physics.mjx"
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=300, check=False
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+
+
+@pytest.mark.skipif(not WITHOUT_WARP, reason="the extra 'warp' is installed")
+def test_mjx_warp_without_its_extra_is_refused(scene):
+    with pytest.raises(ValueError, match=r"needs the extra 'warp': pip install 'mjx-arm\[warp\]'"):
+        make_physics(scene, "mjx-warp")
+
+
+@pytest.mark.skipif(WITHOUT_WARP, reason="needs the extra 'warp': pip install 'mjx-arm[warp]'")
+def test_mjx_warp_goes_where_native_goes(scene, ids):
+    qpos = jnp.asarray(np.tile(ids.home_qpos, (4, 1)))
+    ctrl = np.tile(ids.home_ctrl, (4, 1))
+    ctrl[:, ids.arm_ctrl] += np.float32(0.1)
+    ends = []
+    for backend in ("native", "mjx-warp"):
+        physics = make_physics(scene, backend)
+        start = jax.vmap(physics.init)(qpos, jnp.asarray(ctrl))
+        ends.append(scan_of(physics)(start, jnp.asarray(np.tile(ctrl, (20, 1, 1))))[0])
+    native, warp = ends
+    assert not warp.diverged.any()
+    np.testing.assert_allclose(warp.qpos, native.qpos, atol=1e-3)
