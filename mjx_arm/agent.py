@@ -10,7 +10,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from mjx_arm.checkpoint import load_params, save_params
+from mjx_arm.checkpoint import load_tree, save_tree
 from mjx_arm.config import TrainConfig
 from mjx_arm.dqn import DQN, epsilon_greedy
 from mjx_arm.env import Env, make_env
@@ -74,7 +74,7 @@ def load_config(folder: pathlib.Path) -> TrainConfig:
 
 def save_agent_params(folder: pathlib.Path, params: Any) -> None:
     """Writes the parameters of a run folder's agent."""
-    save_params(folder / _PARAMS, params)
+    save_tree(folder / _PARAMS, params)
 
 
 def load_agent(folder: str | pathlib.Path, **options: Any) -> Agent:
@@ -100,4 +100,4 @@ def load_agent(folder: str | pathlib.Path, **options: Any) -> Agent:
         obs, _ = env.reset(jax.random.key(0))
         return dqn.init_params(jax.random.key(0), jax.tree.map(lambda x: x[None], obs))
 
-    return Agent(config, env, dqn, load_params(folder / _PARAMS, jax.eval_shape(init)))
+    return Agent(config, env, dqn, load_tree(folder / _PARAMS, jax.eval_shape(init)))

@@ -18,7 +18,7 @@ from mjx_arm.config import TrainConfig
 from mjx_arm.evaluate import evaluate
 from mjx_arm.report.figures import plot_curves
 from mjx_arm.report.video import draw_episode, record_episode, write_video
-from mjx_arm.train import train
+from mjx_arm.train import RunInterruptedError, resume, train
 
 
 @dataclasses.dataclass(frozen=True)
@@ -28,19 +28,38 @@ class Train:
     Attributes:
       config: options of the run.
       out: folder for everything the run leaves; by default `runs/` and the time.
+      resume: folder of a run to go on with; of the options only `--total-steps` may then change.
       eval_episodes: episodes of the evaluation at the end.
     """
 
     config: Annotated[TrainConfig, tyro.conf.arg(name="")]
     out: pathlib.Path | None = None
+    resume: pathlib.Path | None = None
     eval_episodes: int = 200
 
-    def run(self) -> None:
-        """Runs the command."""
+    def run(self, given: frozenset[str]) -> None:
+        """Runs the command; `given` are the names of the options on the command line."""
+        if self.resume is not None:
+            self._resume(self.resume, given)
+            return
         now = datetime.datetime.now().strftime("%Y-%m-%d-%H%M%S")
         folder = self.out or pathlib.Path("runs") / f"{now}-{self.config.env}"
         console = Console(highlight=False)
         train(self.config, folder, eval_episodes=self.eval_episodes, console=console)
+
+    def _resume(self, folder: pathlib.Path, given: frozenset[str]) -> None:
+        saved = load_config(folder)
+        changed = given - {"resume", "total_steps", "eval_episodes"}
+        for name in sorted(changed):
+            if getattr(self.config, name, None) != getattr(saved, name, folder):
+                option = name.replace("_", "-")
+                raise ValueError(f"--{option} cannot change when a run goes on; leave it out")
+        resume(
+            folder,
+            total_steps=self.config.total_steps if "total_steps" in given else None,
+            eval_episodes=self.eval_episodes,
+            console=Console(highlight=False),
+        )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -79,8 +98,9 @@ class Eval(_Try):
     episodes: int = 1000
     json: bool = False
 
-    def run(self) -> None:
+    def run(self, given: frozenset[str]) -> None:
         """Runs the command."""
+        del given
         agent = self.load()
         result = evaluate(
             agent.env,
@@ -108,8 +128,9 @@ class Play(_Try):
 
     out: pathlib.Path = pathlib.Path("video.mp4")
 
-    def run(self) -> None:
+    def run(self, given: frozenset[str]) -> None:
         """Runs the command."""
+        del given
         agent = self.load()
         episode = record_episode(
             agent.env, agent.dqn.apply, agent.params, epsilon=self.epsilon, seed=self.seed
@@ -128,8 +149,9 @@ class Figures:
 
     folder: tyro.conf.Positional[pathlib.Path]
 
-    def run(self) -> None:
+    def run(self, given: frozenset[str]) -> None:
         """Runs the command."""
+        del given
         for path in plot_curves(self.folder):
             print(path)
 
@@ -138,11 +160,21 @@ Command = Train | Eval | Play | Figures
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs the command line; returns the exit status: 2 for input that does not fit."""
+    """Runs the command line.
+
+    Returns:
+      The exit status: 2 for input that does not fit, 130 for a run that was interrupted.
+    """
+    arguments = sys.argv[1:] if arguments is None else arguments
+    names = (x[2:].split("=")[0] for x in arguments if x.startswith("--"))
+    given = frozenset(name.removeprefix("no-").replace("-", "_") for name in names)
     try:
         command: Command = tyro.cli(Command, args=arguments, prog="mjx-arm")
-        command.run()
+        command.run(given)
     except ValueError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
+    except RunInterruptedError as stop:
+        print(stop, file=sys.stderr)
+        return 130
     return 0

@@ -33,6 +33,7 @@ def test_a_run_leaves_everything(run_folder):
     names = {path.name for path in run_folder.iterdir()}
     assert names == {
         *("config.json", "metrics.jsonl", "tensorboard", "params", "evaluation.json"),
+        *("checkpoints",),
         *("figure3.png", "learning.png", "policy.mp4"),
     }
     rows = read_metrics(run_folder)

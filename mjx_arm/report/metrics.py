@@ -39,6 +39,17 @@ class MetricsWriter:
                 self._events.add_scalar(name, value, int(metrics["env_steps"]))
 
 
+def keep_metrics(folder: pathlib.Path, env_steps: int) -> None:
+    """Drops the lines of `metrics.jsonl` after so many environment steps, which come again."""
+    path = folder / "metrics.jsonl"
+    lines = path.read_text().splitlines(keepends=True) if path.is_file() else []
+    whole = [line for line in lines if line.endswith("\n")]
+    kept = [line for line in whole if json.loads(line)["env_steps"] <= env_steps]
+    shorter = path.with_suffix(".part")
+    shorter.write_text("".join(kept))
+    shorter.replace(path)
+
+
 def read_metrics(folder: pathlib.Path) -> list[dict[str, float]]:
     """Reads `metrics.jsonl` of a run folder; null becomes NaN.
 
