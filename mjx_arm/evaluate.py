@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 from collections.abc import Callable
 from typing import Any
@@ -86,33 +87,13 @@ def evaluate(
     if not 0.0 <= epsilon <= 1.0:
         raise ValueError(f"epsilon is {epsilon}: give 0 to 1")
     auto = AutoReset(env)
-    num_envs = min(episodes, _MAX_ENVS)
-
-    @jax.jit
-    def start(key: jax.Array) -> _Run:
-        reset_key, key = jax.random.split(key)
-        obs, envs = jax.vmap(auto.reset)(jax.random.split(reset_key, num_envs))
-        quota = np.full(num_envs, episodes // num_envs)
-        quota[: episodes % num_envs] += 1
-        zero = jnp.zeros((num_envs,), jnp.int32)
-        names = ("episodes", "successes", "length", "grasped", "regrasps")
-        return _Run(
-            envs=envs,
-            obs=obs,
-            key=key,
-            left=jnp.asarray(quota, jnp.int32),
-            grasps=zero,
-            held=jnp.zeros((num_envs,), jnp.bool_),
-            totals={name: jnp.zeros((), jnp.int32) for name in names},
-        )
 
     @jax.jit
     def advance(params: Any, run: _Run) -> _Run:
-        return jax.lax.fori_loop(
-            0, _CHUNK, lambda _, r: _step(auto, apply, params, epsilon, r), run
-        )
+        step = functools.partial(_step, auto, apply, params, epsilon)
+        return jax.lax.fori_loop(0, _CHUNK, lambda _, run: step(run), run)
 
-    run = start(jax.random.key(seed))
+    run = jax.jit(functools.partial(_start, auto, episodes))(jax.random.key(seed))
     while int(jnp.max(run.left)) > 0:
         run = advance(params, run)
     totals = {name: int(total) for name, total in run.totals.items()}
@@ -125,6 +106,24 @@ def evaluate(
         mean_length=totals["length"] / episodes,
         grasp_rate=totals["grasped"] / episodes,
         regrasps=totals["regrasps"] / episodes,
+    )
+
+
+def _start(auto: AutoReset, episodes: int, key: jax.Array) -> _Run:
+    num_envs = min(episodes, _MAX_ENVS)
+    reset_key, key = jax.random.split(key)
+    obs, envs = jax.vmap(auto.reset)(jax.random.split(reset_key, num_envs))
+    quota = np.full(num_envs, episodes // num_envs)
+    quota[: episodes % num_envs] += 1
+    names = ("episodes", "successes", "length", "grasped", "regrasps")
+    return _Run(
+        envs=envs,
+        obs=obs,
+        key=key,
+        left=jnp.asarray(quota, jnp.int32),
+        grasps=jnp.zeros((num_envs,), jnp.int32),
+        held=jnp.zeros((num_envs,), jnp.bool_),
+        totals={name: jnp.zeros((), jnp.int32) for name in names},
     )
 
 
