@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import copy
 import io
+import os
 
 import jax
 import jax.numpy as jnp
@@ -23,6 +24,32 @@ _MAX_VALUE = 1e10
 _WARP_CONTACTS = 17 * 4096
 
 
+def _refuse_to_hang(mj_model: mujoco.MjModel) -> None:
+    """Refuses a program that XLA's CPU backend may never finish.
+
+    Its batched Cholesky waits, on a thread of the pool, for pieces of itself that are queued to
+    the same pool (`ParallelBatchMap` in jaxlib 0.10), so that as many of them at once as there are
+    threads wait for ever; 256 environments on two cores did. Each device runs one at a time, or
+    two where the integrator factorises a matrix of its own.
+
+    Raises:
+      ValueError: there may be as many at once as there are threads.
+    """
+    if jax.default_backend() != "cpu":
+        return
+    implicit = mj_model.opt.integrator != mujoco.mjtIntegrator.mjINT_EULER or not (
+        mj_model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_EULERDAMP
+    )
+    at_once = jax.local_device_count() * (2 if implicit else 1)
+    threads = int(os.environ.get("NPROC", os.cpu_count() or 1))
+    if 1 < threads <= at_once:
+        raise ValueError(
+            f"physics 'mjx' can hang on a CPU with {threads} threads and {at_once} matrix "
+            f"factorisations at once: start with NPROC={at_once + 1} in the environment, or give "
+            "physics='native'"
+        )
+
+
 def make_mjx(mj_model: mujoco.MjModel, substeps: int, impl: str = "jax") -> Physics:
     """Makes the backend that runs MJX.
 
@@ -33,7 +60,12 @@ def make_mjx(mj_model: mujoco.MjModel, substeps: int, impl: str = "jax") -> Phys
 
     Returns:
       The record of functions.
+
+    Raises:
+      ValueError: on this CPU the program could hang.
     """
+    if impl == "jax":
+        _refuse_to_hang(mj_model)
     kinematics = make_kinematics(mj_model)
     # MJX never resets by itself, and its "warp" refuses to be told not to.
     told = copy.copy(mj_model)

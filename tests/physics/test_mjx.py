@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import copy
 import importlib.util
 import subprocess
 import sys
@@ -12,6 +13,7 @@ import pytest
 from physics_lab import scan_of
 
 from mjx_arm.physics import make_physics
+from mjx_arm.physics.mjx import make_mjx
 
 WITHOUT_WARP = importlib.util.find_spec("warp") is None
 
@@ -44,20 +46,41 @@ print(bool(jnp.isfinite(jax.jit(run)(state, ctrl).qpos).all()))
 @pytest.mark.slow
 @pytest.mark.parametrize("devices", [1, 2])
 def test_many_environments_on_cpu_come_to_an_end(devices, monkeypatch):
-    # A batched Cholesky on XLA's CPU blocks a thread of the pool that its own pieces wait for, so
-    # two at a time hang for ever: 256 environments did with `implicitfast`, which has a second one.
     monkeypatch.setenv("JAX_PLATFORMS", "cpu")
     monkeypatch.setenv("XLA_FLAGS", f"--xla_force_host_platform_device_count={devices}")
+    monkeypatch.setenv("NPROC", str(devices + 1))
     done = subprocess.run(
         [sys.executable, "-c", MANY], capture_output=True, text=True, timeout=900, check=False
     )
     assert done.stdout.strip() == "True", done.stderr
 
 
-def test_the_scene_gives_mjx_no_second_cholesky(scene):
-    model = scene.mj_model
-    assert model.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER
-    assert model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_EULERDAMP
+@pytest.fixture
+def on_two_threads(monkeypatch):
+    if jax.default_backend() != "cpu":
+        pytest.skip("only XLA's CPU backend hangs")
+    monkeypatch.setenv("NPROC", "2")
+
+
+def test_a_program_that_may_hang_is_refused(scene, on_two_threads):
+    model = copy.copy(scene.mj_model)
+    model.opt.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    with pytest.raises(ValueError, match="start with NPROC=3 in the environment, or give"):
+        make_mjx(model, 2)
+
+
+def test_as_many_devices_as_threads_are_refused(scene, on_two_threads, monkeypatch):
+    monkeypatch.setattr(jax, "local_device_count", lambda: 2)
+    with pytest.raises(ValueError, match="2 threads and 2 matrix factorisations at once"):
+        make_physics(scene, "mjx")
+
+
+@pytest.mark.parametrize(("integrator", "threads"), [("IMPLICITFAST", "3"), ("EULER", "2")])
+def test_enough_threads_are_not_refused(scene, on_two_threads, monkeypatch, integrator, threads):
+    monkeypatch.setenv("NPROC", threads)
+    model = copy.copy(scene.mj_model)
+    model.opt.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{integrator}")
+    assert make_mjx(model, 2).backend == "mjx"
 
 
 def test_importing_mjx_prints_nothing():
