@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 
 from mjx_arm.checkpoint import load_tree, save_tree
-from mjx_arm.config import TrainConfig
+from mjx_arm.config import EnvConfig, TrainConfig
 from mjx_arm.dqn import DQN, epsilon_greedy
 from mjx_arm.env import Env, make_env
 from mjx_arm.loop import make_dqn
@@ -77,13 +77,16 @@ def save_agent_params(folder: pathlib.Path, params: Any) -> None:
     save_tree(folder / _PARAMS, params)
 
 
-def load_agent(folder: str | pathlib.Path, **options: Any) -> Agent:
+def load_agent(
+    folder: str | pathlib.Path, *, max_steps: int = EnvConfig.max_steps, **options: Any
+) -> Agent:
     """Reads a trained agent, with the environment to try it in.
 
     In environment B that is one where the cube moves after every episode, failed ones included.
 
     Args:
       folder: a run folder.
+      max_steps: iterations until an episode is truncated, whatever it was in training.
       **options: fields of `TrainConfig` to change, such as `physics` or `env`.
 
     Raises:
@@ -93,7 +96,7 @@ def load_agent(folder: str | pathlib.Path, **options: Any) -> Agent:
     config = dataclasses.replace(load_config(folder), **options)
     trained_in = config.env_config()
     moves = trained_in.cube_moves if trained_in.cube_moves == "never" else "always"
-    env = make_env(dataclasses.replace(trained_in, cube_moves=moves))
+    env = make_env(dataclasses.replace(trained_in, cube_moves=moves, max_steps=max_steps))
     dqn = make_dqn(config, env)
 
     def init() -> Any:

@@ -14,7 +14,7 @@ import tyro
 from rich.console import Console
 
 from mjx_arm.agent import Agent, load_agent, load_config
-from mjx_arm.config import TrainConfig
+from mjx_arm.config import EnvConfig, TrainConfig
 from mjx_arm.evaluate import evaluate
 from mjx_arm.report.figures import plot_curves
 from mjx_arm.report.video import draw_episode, record_episode, write_video
@@ -72,6 +72,7 @@ class _Try:
       physics: backend; by default that of the run.
       epsilon: share of random actions.
       seed: of starts and random actions.
+      max_steps: iterations until an episode is truncated.
     """
 
     agent: tyro.conf.Positional[pathlib.Path]
@@ -79,11 +80,12 @@ class _Try:
     physics: str | None = None
     epsilon: float = 0.1
     seed: int = 7
+    max_steps: int = EnvConfig.max_steps
 
     def load(self) -> Agent:
         config = load_config(self.agent)
         env, physics = self.env or config.env, self.physics or config.physics
-        return load_agent(self.agent, env=env, physics=physics)
+        return load_agent(self.agent, max_steps=self.max_steps, env=env, physics=physics)
 
 
 @dataclasses.dataclass(frozen=True)

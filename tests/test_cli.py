@@ -52,7 +52,8 @@ def read_video(path: pathlib.Path) -> np.ndarray:
 
 def test_the_video_shows_the_scene_and_the_agents_view(run_folder):
     frames = read_video(run_folder / "policy.mp4")
-    assert frames.shape == (26, 384, 768, 3)
+    assert 100 < len(frames) <= 1001
+    assert frames.shape[1:] == (384, 768, 3)
     for half in (frames[0, :, :384], frames[0, :, 384:]):
         assert half.std() > 5
 
@@ -149,9 +150,9 @@ def test_eval_prints_json(run_folder, capsys):
 
 def test_play_writes_a_gif(run_folder, tmp_path, capsys):
     path = tmp_path / "policy.gif"
-    assert main(["play", str(run_folder), "--out", str(path)]) == 0
+    assert main(["play", str(run_folder), "--out", str(path), "--max-steps", "25"]) == 0
     assert imageio.imread(path, index=0).shape == (384, 768, 3)
-    assert "26 frames" in capsys.readouterr().out
+    assert "26 frames, success: False" in capsys.readouterr().out
 
 
 def test_figures_draws_the_curves_again(run_folder, capsys):
