@@ -10,10 +10,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_arm.physics import Physics, PhysicsState, make_physics
+from mjx_arm.physics import Physics, PhysicsState, compiler_options, make_physics
 from mjx_arm.scene import Scene, TaskIds, load_scene, resolve_task
 
-# Compiling MJX takes most of a minute on two cores, so that every test steps as many environments.
+# Compiling MJX takes half a minute on two busy cores: every test steps as many environments.
 NUM_ENVS = 12
 BACKENDS = ("native", "mjx")
 
@@ -64,7 +64,8 @@ def make_lab(backend: str) -> Lab:
     qpos = jnp.asarray(np.tile(ids.home_qpos, (NUM_ENVS, 1)))
     ctrl = jnp.asarray(np.tile(ids.home_ctrl, (NUM_ENVS, 1)))
     init = jax.jit(jax.vmap(physics.init))
-    step = jax.jit(jax.vmap(physics.step)).lower(init(qpos, ctrl), ctrl).compile()
+    step = jax.jit(jax.vmap(physics.step), compiler_options=compiler_options(physics))
+    step(init(qpos, ctrl), ctrl)
     # Copies, since jax takes numpy's memory as it is, and the tests go on writing to theirs.
     return Lab(
         scene,

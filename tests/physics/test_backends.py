@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from physics_lab import NUM_ENVS, Lab
 
-from mjx_arm.physics import make_physics
+from mjx_arm.physics import compiler_options, make_physics
 
 MOST_ANGLE_DIFFERENCE = 0.05
 MOST_PLACE_DIFFERENCE = 1e-3
@@ -93,14 +93,15 @@ def test_a_poisoned_state_ends_its_own_episode_only(lab, in_empty_folder, capfd)
     assert capfd.readouterr() == ("", "")
 
 
-@pytest.mark.parametrize("backend", ["native", pytest.param("mjx", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("backend", ["native", "mjx"])
 def test_nested_vmap_gives_the_same_as_flat(labs, backend):
     lab = labs[backend]
     qpos, _ = lab.home()
     ctrl = random_controls(lab, 3, seed=1)
     flat = lab.init(qpos, ctrl[0])
     nested = jax.tree.map(lambda x: x.reshape(3, NUM_ENVS // 3, *x.shape[1:]), flat)
-    step = jax.jit(jax.vmap(jax.vmap(lab.physics.step)))
+    options = compiler_options(lab.physics)
+    step = jax.jit(jax.vmap(jax.vmap(lab.physics.step)), compiler_options=options)
     for row in ctrl:
         flat = lab.step(flat, row)
         nested = step(nested, jnp.asarray(row, jnp.float32).reshape(3, NUM_ENVS // 3, -1))
@@ -120,3 +121,9 @@ def test_auto_is_native_on_cpu(scene):
 def test_unknown_backend_is_refused(scene):
     with pytest.raises(ValueError, match="unknown physics 'bullet': give one of auto, mjx"):
         make_physics(scene, "bullet")
+
+
+def test_only_mjx_on_cpu_is_compiled_in_its_own_way(labs):
+    on_cpu = jax.default_backend() == "cpu"
+    assert bool(compiler_options(labs["mjx"].physics)) == on_cpu
+    assert not compiler_options(labs["native"].physics)
