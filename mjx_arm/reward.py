@@ -42,7 +42,7 @@ def reward_terms(
     else:
         reach = config.completion_reach * jnp.exp(-config.completion_decay * units)
         hold = jnp.full_like(height, config.completion_hold)
-        lifted = config.completion_lift * jnp.clip(height / lift, 0.0, 1.0)
+        lifted = config.completion_lift * jnp.sqrt(jnp.clip(height / lift, 0.0, 1.0))
     zero = jnp.zeros_like(height)
     holding = grasped & ~success
     terms = {
