@@ -16,6 +16,7 @@ import numpy as np
 from mjx_arm.auto_reset import AutoReset, AutoResetState
 from mjx_arm.dqn import epsilon_greedy
 from mjx_arm.env import Env
+from mjx_arm.physics import compiler_options
 
 # Environments side by side, and iterations in one compiled call.
 _MAX_ENVS = 200
@@ -88,11 +89,11 @@ def evaluate(
         raise ValueError(f"epsilon is {epsilon}: give 0 to 1")
     auto = AutoReset(env)
 
-    @jax.jit
-    def advance(params: Any, run: _Run) -> _Run:
+    def advance_run(params: Any, run: _Run) -> _Run:
         step = functools.partial(_step, auto, apply, params, epsilon)
         return jax.lax.fori_loop(0, _CHUNK, lambda _, run: step(run), run)
 
+    advance = jax.jit(advance_run, compiler_options=compiler_options(env.physics))
     run = jax.jit(functools.partial(_start, auto, episodes))(jax.random.key(seed))
     while int(jnp.max(run.left)) > 0:
         run = advance(params, run)

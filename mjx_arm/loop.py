@@ -18,6 +18,7 @@ from mjx_arm.dqn import DQN, Learner, epsilon_greedy
 from mjx_arm.env import Env, Transition, make_env
 from mjx_arm.kinematics import make_kinematics
 from mjx_arm.networks import FeatureQNetwork, PixelQNetwork
+from mjx_arm.physics import compiler_options
 from mjx_arm.replay import Replay, Step, add, init_replay, sample
 
 Obs = Any
@@ -89,7 +90,9 @@ def make_trainer(config: TrainConfig) -> Trainer:
         env=env,
         dqn=body.dqn,
         init=jax.jit(body.init),
-        run_chunk=jax.jit(run_chunk, donate_argnums=0),
+        run_chunk=jax.jit(
+            run_chunk, donate_argnums=0, compiler_options=compiler_options(env.physics)
+        ),
     )
 
 

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_arm.env import Env, EnvState
+from mjx_arm.physics import compiler_options
 from mjx_arm.task import CLOSE, NUM_ACTIONS, OPEN
 
 Policy = Callable[[jax.Array, EnvState], jax.Array]
@@ -25,7 +26,10 @@ def rollout(env: Env, policy: Policy, *, num_envs: int, length: int, seed: int):
         return state, (state, transition)
 
     keys = jax.random.split(key, length)
-    _, (states, transitions) = jax.jit(lambda s, k: jax.lax.scan(step, s, k))(start, keys)
+    run = jax.jit(
+        lambda s, k: jax.lax.scan(step, s, k), compiler_options=compiler_options(env.physics)
+    )
+    _, (states, transitions) = run(start, keys)
     return jax.device_get(states), jax.device_get(transitions)
 
 

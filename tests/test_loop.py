@@ -125,3 +125,11 @@ def test_configuration_is_never_mutated(run):
     assert trainer.config == CONFIG
     with pytest.raises(dataclasses.FrozenInstanceError):
         trainer.config.seed = 2
+
+
+@pytest.mark.slow
+def test_mjx_trains_too():
+    _, _, rows = train(dataclasses.replace(CONFIG, physics="mjx", total_steps=160), chunks=2)
+    assert rows[-1]["updates"] > 0
+    assert rows[-1]["diverged"] == 0
+    assert np.isfinite(rows[-1]["loss"])

@@ -14,6 +14,7 @@ import numpy as np
 
 from mjx_arm.dqn import epsilon_greedy
 from mjx_arm.env import Env
+from mjx_arm.physics import compiler_options
 from mjx_arm.render import make_renderer, rgb
 
 _EDGE = 384
@@ -53,7 +54,6 @@ def record_episode(
         running &= ~(transition.terminated | transition.truncated)
         return (after, key, running), record
 
-    @jax.jit
     def run(key: jax.Array) -> tuple[jax.Array, ...]:
         reset_key, key = jax.random.split(key)
         _, state = env.reset(reset_key)
@@ -61,7 +61,8 @@ def record_episode(
         (last, _, _), records = jax.lax.scan(step, start, None, length=env.config.max_steps)
         return last.physics.qpos, *records
 
-    last, qpos, running, success = jax.device_get(run(jax.random.key(seed)))
+    compiled = jax.jit(run, compiler_options=compiler_options(env.physics))
+    last, qpos, running, success = jax.device_get(compiled(jax.random.key(seed)))
     length = int(running.sum())
     after = qpos[length] if length < len(qpos) else last
     return Episode(qpos=np.concatenate([qpos[:length], after[None]]), success=bool(success.any()))
