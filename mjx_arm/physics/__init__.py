@@ -13,6 +13,8 @@ __all__ = ["BACKENDS", "Physics", "PhysicsState", "compiler_options", "make_phys
 
 BACKENDS = ("auto", "mjx", "mjx-warp", "native")
 
+_JAX_VERSION = tuple(int(part) for part in jax.__version__.split(".")[:2])
+
 
 def make_physics(scene: Scene, backend: str = "auto") -> Physics:
     """Makes the physics of a scene.
@@ -51,9 +53,9 @@ def make_physics(scene: Scene, backend: str = "auto") -> Physics:
 def compiler_options(physics: Physics) -> dict[str, bool]:
     """Options for `jax.jit` of a program that steps this physics.
 
-    On CPU, XLA's fusion emitters make MJX 10 times slower (64 environments on two cores: 1,000
-    substeps/s with them and 12,000 without) and its compilation half as long again.
+    On CPU, the fusion emitters of XLA in jax 0.10 make MJX 10 times slower (64 environments on two
+    cores: 1,000 substeps/s with them, 12,000 without) and its compilation half as long again. In
+    jax 0.11 they do not, and cannot be turned off.
     """
-    if physics.backend == "mjx" and jax.default_backend() == "cpu":
-        return {"xla_cpu_use_fusion_emitters": False}
-    return {}
+    slow = physics.backend == "mjx" and jax.default_backend() == "cpu"
+    return {"xla_cpu_use_fusion_emitters": False} if slow and _JAX_VERSION < (0, 11) else {}

@@ -124,6 +124,6 @@ def test_unknown_backend_is_refused(scene):
 
 
 def test_only_mjx_on_cpu_is_compiled_in_its_own_way(labs):
-    on_cpu = jax.default_backend() == "cpu"
-    assert bool(compiler_options(labs["mjx"].physics)) == on_cpu
+    slow = jax.default_backend() == "cpu" and jax.__version__.startswith("0.10.")
+    assert bool(compiler_options(labs["mjx"].physics)) == slow
     assert not compiler_options(labs["native"].physics)
