@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import contextlib
+import gc
 import pathlib
 import shutil
+import warnings
 from typing import Any
 
 import jax
 
 _KEPT = 2
 _DIGITS = 12
+_READ_ERRORS = (ValueError, KeyError, TypeError, OSError)
 
 
 def save_tree(path: pathlib.Path, tree: Any) -> None:
@@ -39,11 +43,16 @@ def load_tree(path: pathlib.Path, like: Any) -> Any:
 
     if not path.is_dir():
         raise ValueError(f"{path} is not a checkpoint")
-    try:
-        with ocp.StandardCheckpointer() as checkpointer:
-            return _from_data(checkpointer.restore(path.absolute(), _to_data(like)), like)
-    except (ValueError, KeyError, TypeError, OSError) as error:
-        raise ValueError(f"{path} is damaged, or not a checkpoint of such a run") from error
+    data = None
+    with ocp.StandardCheckpointer() as checkpointer, contextlib.suppress(*_READ_ERRORS):
+        data = checkpointer.restore(path.absolute(), _to_data(like))
+    if data is None:
+        # A failed read leaves its other coroutines un-awaited, of which Python would complain.
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", RuntimeWarning)
+            gc.collect()
+        raise ValueError(f"{path} is damaged, or not a checkpoint of such a run")
+    return _from_data(data, like)
 
 
 class RunCheckpoints:

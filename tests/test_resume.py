@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import gc
 import os
 import pathlib
 import random
@@ -97,13 +96,6 @@ def test_a_changed_option_is_refused_by_name(arguments, message, whole_run, caps
     assert message in capsys.readouterr().err
 
 
-# orbax leaves the rest of a failed read un-awaited, which is found when it is collected.
-leaves_coroutines = pytest.mark.filterwarnings(
-    "ignore::pytest.PytestUnraisableExceptionWarning", "ignore:coroutine:RuntimeWarning"
-)
-
-
-@leaves_coroutines
 def test_a_damaged_checkpoint_is_named_and_the_one_before_offered(whole_run, tmp_path, capsys):
     folder = tmp_path / "run"
     shutil.copytree(whole_run, folder)
@@ -118,7 +110,6 @@ def test_a_damaged_checkpoint_is_named_and_the_one_before_offered(whole_run, tmp
     assert error.count("\n") == 1
     assert str(damaged) in error
     assert f"{steps[0]:012d}" in error
-    gc.collect()
 
 
 def test_what_holds_no_run_is_refused(tmp_path, capsys):
@@ -126,13 +117,11 @@ def test_what_holds_no_run_is_refused(tmp_path, capsys):
     assert "is no run folder" in capsys.readouterr().err
 
 
-@leaves_coroutines
 def test_checkpoints_of_another_network_are_refused(whole_run):
     config = dataclasses.replace(load_config(whole_run), hidden=17)
     like = jax.eval_shape(make_trainer(config).init, jax.random.key(0))
     with pytest.raises(ValueError, match="damaged, or not a checkpoint of such a run"):
         RunCheckpoints(whole_run).load(RunCheckpoints(whole_run).steps()[-1], like)
-    gc.collect()
 
 
 def test_the_default_checkpoint_is_small(tmp_path):
