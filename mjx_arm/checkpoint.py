@@ -1,23 +1,21 @@
-"""Checkpoints on disk, by orbax: written whole or not at all, the last two and the best kept."""
+"""Checkpoints on disk, by orbax: whole or not there at all, and the last two of a run kept."""
 
 from __future__ import annotations
 
-import contextlib
-import gc
+import json
 import pathlib
 import shutil
-import warnings
 from typing import Any
 
 import jax
 
 _KEPT = 2
 _DIGITS = 12
-_READ_ERRORS = (ValueError, KeyError, TypeError, OSError)
+_MANIFEST = "manifest.json"
 
 
 def save_tree(path: pathlib.Path, tree: Any) -> None:
-    """Writes a pytree of arrays to a folder; an interrupted write leaves no such folder.
+    """Writes a pytree of arrays to a folder, and last a manifest without which it does not count.
 
     Raises:
       ValueError: the disk is full, or the folder cannot be written.
@@ -28,6 +26,10 @@ def save_tree(path: pathlib.Path, tree: Any) -> None:
     try:
         with ocp.StandardCheckpointer() as checkpointer:
             checkpointer.save(path.absolute(), _to_data(tree), force=True)
+        manifest = {"files": _file_sizes(path), "arrays": _describe(tree)}
+        part = path / f"{_MANIFEST}.part"
+        part.write_text(json.dumps(manifest))
+        part.replace(path / _MANIFEST)
     except (OSError, ValueError) as error:
         reason = " ".join(str(error).split())[:200]
         raise ValueError(f"the checkpoint {path} could not be written: {reason}") from error
@@ -41,18 +43,35 @@ def load_tree(path: pathlib.Path, like: Any) -> Any:
     """
     import orbax.checkpoint as ocp
 
-    if not path.is_dir():
-        raise ValueError(f"{path} is not a checkpoint")
-    data = None
-    with ocp.StandardCheckpointer() as checkpointer, contextlib.suppress(*_READ_ERRORS):
-        data = checkpointer.restore(path.absolute(), _to_data(like))
-    if data is None:
-        # A failed read leaves its other coroutines un-awaited, of which Python would complain.
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", RuntimeWarning)
-            gc.collect()
-        raise ValueError(f"{path} is damaged, or not a checkpoint of such a run")
-    return _from_data(data, like)
+    # Checked beforehand: a read that fails half-way leaves orbax with coroutines to complain of.
+    if not (path / _MANIFEST).is_file():
+        raise ValueError(f"{path} is not a checkpoint, or not a whole one")
+    try:
+        manifest = json.loads((path / _MANIFEST).read_text())
+    except json.JSONDecodeError:
+        manifest = {"files": None}
+    if manifest["files"] != _file_sizes(path):
+        raise ValueError(f"{path} is damaged: its files are not those that were written")
+    if manifest["arrays"] != _describe(like):
+        raise ValueError(f"{path} is not a checkpoint of such a run")
+    with ocp.StandardCheckpointer() as checkpointer:
+        return _from_data(checkpointer.restore(path.absolute(), _to_data(like)), like)
+
+
+def _file_sizes(path: pathlib.Path) -> dict[str, int]:
+    """Bytes of each file of a checkpoint, but for the manifest."""
+    files = (file for file in path.rglob("*") if file.is_file())
+    return {
+        str(file.relative_to(path)): file.stat().st_size
+        for file in files
+        if not file.name.startswith(_MANIFEST)
+    }
+
+
+def _describe(tree: Any) -> list[str]:
+    """Path, shape and dtype of each array."""
+    leaves = jax.tree_util.tree_flatten_with_path(tree)[0]
+    return [f"{jax.tree_util.keystr(p)} {x.shape} {x.dtype}" for p, x in leaves]
 
 
 class RunCheckpoints:
@@ -71,7 +90,8 @@ class RunCheckpoints:
         """Vector steps of the checkpoints there are, the oldest first."""
         if not self._folder.is_dir():
             return []
-        names = (path.name for path in self._folder.iterdir())
+        whole = (path for path in self._folder.iterdir() if (path / _MANIFEST).is_file())
+        names = (path.name for path in whole)
         return sorted(int(name) for name in names if len(name) == _DIGITS and name.isdigit())
 
     def load_newest(self, like: Any) -> tuple[Any, int]:

@@ -120,7 +120,7 @@ def test_what_holds_no_run_is_refused(tmp_path, capsys):
 def test_checkpoints_of_another_network_are_refused(whole_run):
     config = dataclasses.replace(load_config(whole_run), hidden=17)
     like = jax.eval_shape(make_trainer(config).init, jax.random.key(0))
-    with pytest.raises(ValueError, match="damaged, or not a checkpoint of such a run"):
+    with pytest.raises(ValueError, match="is not a checkpoint of such a run"):
         RunCheckpoints(whole_run).load(RunCheckpoints(whole_run).steps()[-1], like)
 
 
