@@ -35,8 +35,3 @@ def float32_to_bits(value: jax.Array) -> jax.Array:
 def float64_to_words(values: np.ndarray) -> np.ndarray:
     """A view of `[..., n] float64`, its last axis contiguous, as `[..., 2 n] uint32`."""
     return values.view(np.uint32)
-
-
-def words_to_float64(words: np.ndarray) -> np.ndarray:
-    """A view of `[..., 2 n] uint32`, its last axis contiguous, as `[..., n] float64`."""
-    return words.view(np.float64)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import functools
+import math
 import os
 import threading
 from collections.abc import Callable, Iterator
@@ -21,15 +22,17 @@ import numpy as np
 from jax.experimental.buffer_callback import Buffer, buffer_callback
 from mujoco import batch as mj_batch
 
-from mjx_arm.kinematics import make_kinematics
+from mjx_arm.kinematics import Poses, make_kinematics
 from mjx_arm.physics.base import Physics, PhysicsState
-from mjx_arm.physics.float_bits import float32_to_bits, float64_to_words, words_to_float64
+from mjx_arm.physics.float_bits import float32_to_bits, float64_to_words
 
 _STATE = mujoco.mjtState
 # Components that change while a simulation runs; they lead the row, controls follow.
 _CARRIED = (
     _STATE.mjSTATE_TIME | _STATE.mjSTATE_QPOS | _STATE.mjSTATE_QVEL | _STATE.mjSTATE_WARMSTART
 )
+# `step` leaves derived fields a substep behind the state; this stage brings the poses up to it.
+_POSITION = mujoco.mjtStage.mjSTAGE_POS
 
 
 class BatchPool:
@@ -99,12 +102,13 @@ class _Layout:
     """Words of a simulation's row, one array each way: every further operand costs 10 us a call.
 
     In: the carried state in two words a number, then `ctrl` in float32. Out: the carried state,
-    then `qpos` and `qvel` in float32, then whether the simulation diverged.
+    then `qpos`, `qvel` and the poses in float32, then whether the simulation diverged.
     """
 
     carried: int
     qpos: slice
     qvel: slice
+    poses: dict[str, tuple[int, ...]]
 
     @property
     def carried_words(self) -> int:
@@ -117,7 +121,16 @@ class _Layout:
 
     @property
     def out_size(self) -> int:
-        return self.carried_words + (self.qvel.stop - self.qpos.start) + 1
+        poses = sum(math.prod(shape) for shape in self.poses.values())
+        return self.carried_words + (self.qvel.stop - self.qpos.start) + poses + 1
+
+    def split_poses(self, numbers: jax.Array) -> Poses:
+        """The poses in what follows `qpos` and `qvel`."""
+        arrays, start = {}, 0
+        for name, shape in self.poses.items():
+            arrays[name] = numbers[start : start + math.prod(shape)].reshape(shape)
+            start += math.prod(shape)
+        return Poses(**arrays)
 
 
 def _make_layout(model: mujoco.MjModel) -> _Layout:
@@ -126,7 +139,12 @@ def _make_layout(model: mujoco.MjModel) -> _Layout:
         raise ValueError("the native backend supports no activations, history or plugin state")
     qpos = _offset(model, _STATE.mjSTATE_QPOS)
     qvel = _offset(model, _STATE.mjSTATE_QVEL)
-    return _Layout(carried, slice(qpos, qvel), slice(qvel, qvel + model.nv))
+    poses = {
+        "geom_xpos": (model.ngeom, 3),
+        "geom_xmat": (model.ngeom, 3, 3),
+        "site_xpos": (model.nsite, 3),
+    }
+    return _Layout(carried, slice(qpos, qvel), slice(qvel, qvel + model.nv), poses)
 
 
 def _offset(model: mujoco.MjModel, component: mujoco.mjtState) -> int:
@@ -170,12 +188,10 @@ def make_native(mj_model: mujoco.MjModel, substeps: int) -> Physics:
         row = _call_host(step_rows, result, jnp.concatenate([state.integration, ctrl_words]))
         words, observed, diverged = jnp.split(row, [layout.carried_words, layout.out_size - 1])
         observed = jax.lax.bitcast_convert_type(observed, jnp.float32)
-        # Not taken from the Batch: its position stage costs a quarter of an iteration, and the
-        # poses after `step` alone are those before the last substep.
         return PhysicsState(
             qpos=observed[:nq],
-            qvel=observed[nq:],
-            poses=kinematics(observed[:nq]),
+            qvel=observed[nq : nq + nv],
+            poses=layout.split_poses(observed[nq + nv :]),
             diverged=diverged[0] != 0,
             integration=words,
         )
@@ -218,18 +234,36 @@ def _step_rows(
     """Advances `rows [..., 2 carried + nu]` by an iteration into `out [..., out_size]`."""
     rows, out = rows.reshape(-1, rows.shape[-1]), out.reshape(-1, layout.out_size)
     split = layout.carried_words
-    before = words_to_float64(rows[:, :split])
     with pool.borrow(len(rows)) as batch, _silence:
         carried = batch.state[:, : layout.carried]
-        carried[:] = before
+        words = float64_to_words(carried)
+        words[:] = rows[:, :split]
         batch.ctrl[:] = rows[:, split:].view(np.float32)
         failed = _advance(batch, substeps)
-        failed |= ~np.isfinite(carried).all(axis=-1)
+        # The sum is finite where every term is, but for terms that no simulation survives.
+        failed |= ~np.isfinite(carried.sum(axis=-1))
         if failed.any():
-            carried[failed] = before[failed]
-        out[:, :split] = float64_to_words(carried)
-        out[:, split:-1].view(np.float32)[:] = carried[:, layout.observed]
+            words[failed] = rows[failed, :split]
+        out[:, :split] = words
+        numbers = out[:, split:-1].view(np.float32)
+        start = layout.observed.stop - layout.observed.start
+        numbers[:, :start] = carried[:, layout.observed]
+        for name, shape in layout.poses.items():
+            size = math.prod(shape)
+            numbers[:, start : start + size] = batch.bind(name).reshape(len(rows), size)
+            start += size
+        for row in np.flatnonzero(failed):
+            poses = _poses_before(batch.model, layout, carried[row])
+            numbers[row, -len(poses) :] = poses
     out[:, -1] = failed
+
+
+def _poses_before(model: mujoco.MjModel, layout: _Layout, carried: np.ndarray) -> np.ndarray:
+    """The poses of a state that could not be stepped; kinematics cannot fail again."""
+    data = mujoco.MjData(model)
+    data.qpos[:] = carried[layout.qpos]
+    mujoco.mj_kinematics(model, data)
+    return np.concatenate([getattr(data, name).ravel() for name in layout.poses])
 
 
 def _advance(batch: mj_batch.Batch, substeps: int) -> np.ndarray:
@@ -238,7 +272,7 @@ def _advance(batch: mj_batch.Batch, substeps: int) -> np.ndarray:
     warnings[:] = 0
     raised: np.ndarray | list[int] = []
     try:
-        batch.step(nstep=substeps)
+        batch.step(nstep=substeps, stage=_POSITION)
     except mj_batch.SimulationError as error:
         raised = error.ids
     failed = warnings[..., 1].any(axis=-1)
