@@ -1,7 +1,7 @@
 """Forward kinematics: where the geoms and sites of a scene are, given `qpos`.
 
-Poses are computed here from the state that physics returns, for both backends and for frames that
-are rendered again from the replay, so that an image can never lag behind its state by a substep.
+For starts of episodes, for MJX, and for frames that are rendered again from the replay; the native
+backend has MuJoCo compute the same.
 """
 
 from __future__ import annotations
