@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import mjx_arm
 from mjx_arm.config import TrainConfig
 from mjx_arm.loop import epsilon_at, make_trainer, summarise
 
@@ -105,8 +106,12 @@ def test_stored_states_are_drawn_as_they_were_seen():
         states.replay.steps.frame[:held]
     )
     seen = np.asarray(pixels.replay.steps.frame[:held])
-    # Poses by C and by our kinematics differ in the last bit, which may tip a pixel on an edge.
-    assert (np.asarray(drawn) != seen).mean() < 2e-3
+    # Poses by C and by our kinematics differ in the last bit, which may tip a pixel on an edge, or
+    # a colour to the next of its 255 levels.
+    same_geom = mjx_arm.segmentation(drawn) == mjx_arm.segmentation(seen)
+    assert np.mean(np.asarray(same_geom)) > 1 - 2e-3
+    colours = [np.asarray(mjx_arm.rgb(x), int)[np.asarray(same_geom)] for x in (drawn, seen)]
+    assert np.abs(colours[0] - colours[1]).max() <= 1
 
 
 @pytest.mark.parametrize(("steps", "expected"), [(0, 1.0), (50_000, 0.55), (100_000, 0.1)])

@@ -33,6 +33,7 @@ _CARRIED = (
 )
 # `step` leaves derived fields a substep behind the state; this stage brings the poses up to it.
 _POSITION = mujoco.mjtStage.mjSTAGE_POS
+_POSES = ("geom_xpos", "geom_xmat", "site_xpos")
 
 
 class BatchPool:
@@ -66,6 +67,9 @@ class BatchPool:
         # Threads beyond one per simulation would only be woken for nothing.
         batch = mj_batch.Batch(self._model, size, nthread=min(size, os.cpu_count() or 1))
         batch.reset(stage=mujoco.mjtStage.mjSTAGE_NONE)
+        # Bound before the first step, since a field is zero until the call after it was bound.
+        for name in _POSES:
+            batch.bind(name)
         return batch
 
 
@@ -139,11 +143,8 @@ def _make_layout(model: mujoco.MjModel) -> _Layout:
         raise ValueError("the native backend supports no activations, history or plugin state")
     qpos = _offset(model, _STATE.mjSTATE_QPOS)
     qvel = _offset(model, _STATE.mjSTATE_QVEL)
-    poses = {
-        "geom_xpos": (model.ngeom, 3),
-        "geom_xmat": (model.ngeom, 3, 3),
-        "site_xpos": (model.nsite, 3),
-    }
+    shapes = (model.ngeom, 3), (model.ngeom, 3, 3), (model.nsite, 3)
+    poses = dict(zip(_POSES, shapes, strict=True))
     return _Layout(carried, slice(qpos, qvel), slice(qvel, qvel + model.nv), poses)
 
 

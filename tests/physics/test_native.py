@@ -210,3 +210,10 @@ def test_state_that_is_not_carried_is_refused():
     """)
     with pytest.raises(ValueError, match="supports no activations"):
         make_native(model, 1)
+
+
+def test_poses_are_there_from_the_first_call(scene, ids):
+    physics = make_native(scene.mj_model, 2)
+    start = physics.init(ids.home_qpos, ids.home_ctrl)
+    after = jax.jit(physics.step)(start, ids.home_ctrl)
+    np.testing.assert_allclose(after.poses.geom_xpos, start.poses.geom_xpos, atol=0.01)
