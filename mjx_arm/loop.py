@@ -38,7 +38,7 @@ class LoopState:
       key: PRNG key.
       vector_step: `[] int32`, steps of all environments so far.
       episode: running sums of the episodes under way, `[N]` each.
-      counts: sums over all steps so far, `[] float32` and `[] int32`.
+      counts: sums over the steps of this chunk, `[] float32` and `[] int32`.
     """
 
     learner: Learner

@@ -6,12 +6,11 @@ import importlib.util
 
 import jax
 
+from mjx_arm.config import BACKENDS
 from mjx_arm.physics.base import Physics, PhysicsState
 from mjx_arm.scene import Scene, resolve_task
 
 __all__ = ["BACKENDS", "Physics", "PhysicsState", "compiler_options", "make_physics"]
-
-BACKENDS = ("auto", "mjx", "mjx-warp", "native")
 
 _JAX_VERSION = tuple(int(part) for part in jax.__version__.split(".")[:2])
 
