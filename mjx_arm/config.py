@@ -145,7 +145,7 @@ def _positive(name: str, value: float) -> None:
 class TrainConfig:
     """Options of a training run.
 
-    The values are our choice, made on two CPU cores; those of James & Johns 2016 are other ones where
+    The values are our choice, made on two CPU cores; James & Johns 2016 have others where
     they state any (Adam at 6e-6, a replay of 500,000, squared error, episodes of 1,000).
 
     Attributes:
