@@ -6,7 +6,7 @@ import dataclasses
 from typing import Any
 
 OBSERVATIONS = ("rgb", "rgbd", "segmentation", "state", "packed")
-REWARDS = ("paper", "completion")
+REWARDS = ("paper", "completion", "progress")
 CUBE_MOVES = ("never", "on_success", "always")
 STARTS = ("home", "in_grasp")
 BACKENDS = ("auto", "mjx", "mjx-warp", "native")
@@ -14,13 +14,20 @@ BACKENDS = ("auto", "mjx", "mjx-warp", "native")
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class RewardConfig:
-    """Constants of the two rewards. Where the paper names no unit, the unit is our choice.
+    """Constants of the rewards. Where the paper names no unit, the unit is our choice.
 
     Attributes:
-      kind: `"paper"` is Algorithm 1 of James & Johns 2016 to the letter; `"completion"` bounds
-        what a step without success can pay, so that finishing outbids hovering (at discount 0.99
-        the paper's hovering just below 30 cm is worth 130, its success 100).
-      success: paid once on success, both kinds.
+      kind: `"paper"` is Algorithm 1 of James & Johns 2016 to the letter: `success` once, else
+        `1 + height` while grasped, else `exp(-0.25 * distance)`. `"completion"` keeps the shape but
+        bounds what a step without success can pay, so that finishing outbids hovering (at discount
+        0.99 the paper's hovering just below 30 cm is worth 130, its success 100). `"progress"` pays
+        for success alone, and on top the gain of a potential (Ng et al. 1999), which changes no
+        optimal policy: the potential being about what a state is worth, Q-values become small, and
+        a step in the wrong direction is no longer 1 % of one.
+      success: paid once on success, all kinds.
+      discount: of the potential, `progress` only; that of the agent.
+      progress_steps_per_metre: steps that the potential counts for a metre of the gripper.
+      progress_grasp_steps: and for the grasp.
       distance_decay: per `distance_unit`, of the paper's reward; its 0.25.
       distance_unit: m; the paper names none, ours is a decimetre.
       height_unit: m; the unit of the cube's height in the paper's `1 + height`.
@@ -29,11 +36,14 @@ class RewardConfig:
       completion_hold: paid for a grasp at height 0, `completion` only.
       completion_lift: most that is paid on top for the height, with its square root: in proportion
         to it, the first degree of a lift is worth 2 % of a Q-value, and is not found.
-      scale: factor on the sum, both kinds.
+      scale: factor on the sum, all kinds.
     """
 
     kind: str = "paper"
     success: float = 100.0
+    discount: float = 0.99
+    progress_steps_per_metre: float = 160.0
+    progress_grasp_steps: float = 20.0
     distance_decay: float = 0.25
     distance_unit: float = 0.1
     height_unit: float = 1.0
@@ -48,6 +58,8 @@ class RewardConfig:
         _one_of("reward", self.kind, REWARDS)
         for name in ("distance_decay", "completion_decay", "distance_unit", "height_unit", "scale"):
             _positive(f"reward {name}", getattr(self, name))
+        if not 0.0 < self.discount <= 1.0:
+            raise ValueError(f"reward discount is {self.discount}: give more than 0, at most 1")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -155,7 +167,7 @@ class TrainConfig:
       observation: what the network sees: `"packed"` pixels, or `"state"` features.
       size: height and width of the image, pixels.
       shadows: hard shadows in the image.
-      reward: `"completion"` or `"paper"`; see `RewardConfig`.
+      reward: `"progress"`, `"completion"` or `"paper"`; see `RewardConfig`.
       reward_scale: factor on every reward.
       max_steps: iterations until a training episode is truncated. The paper's 1,000, which
         evaluation keeps, spend most of the time on cubes that have been knocked away.
@@ -270,7 +282,9 @@ class TrainConfig:
             observation=self.observation,
             size=self.size,
             shadows=self.shadows,
-            reward=RewardConfig(kind=self.reward, scale=self.reward_scale),
+            reward=RewardConfig(
+                kind=self.reward, scale=self.reward_scale, discount=self.gamma
+            ),
             max_steps=self.max_steps,
         )
 

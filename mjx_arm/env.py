@@ -18,7 +18,7 @@ from mjx_arm.kinematics import Poses
 from mjx_arm.physics import Physics, PhysicsState, make_physics
 from mjx_arm.render import make_renderer, rgb, segmentation
 from mjx_arm.render.renderer import Render, RenderWithDepth
-from mjx_arm.reward import reward_terms
+from mjx_arm.reward import Situation, reward_terms
 from mjx_arm.scene import Scene, TaskIds, load_scene, resolve_task
 from mjx_arm.start import Starts
 from mjx_arm.task import NUM_ACTIONS, apply_action, grasped
@@ -153,33 +153,24 @@ class Env:
     def transition(self, state: EnvState, action: jax.Array | int) -> tuple[EnvState, Transition]:
         """Advances by one iteration without drawing an observation; see `step`."""
         _check_action(action)
-        config, ids = self.config, self.ids
+        config = self.config
         action = jnp.asarray(action, jnp.int32)
-        ctrl = apply_action(ids, state.ctrl, action, config.degrees_per_action)
+        ctrl = apply_action(self.ids, state.ctrl, action, config.degrees_per_action)
         physics = self.physics.step(state.physics, ctrl)
-        poses = physics.poses
-        cube = poses.geom_xpos[ids.cube_geom]
-        height = cube[2] - np.float32(ids.cube_half_size)
-        distance = jnp.sqrt(jnp.sum(jnp.square(poses.site_xpos[ids.grasp_site] - cube)))
-        held = grasped(self.scene.mj_model, ids, poses, ctrl) & ~physics.diverged
-        success = held & (height >= config.lift)
-        terms = reward_terms(
-            config.reward,
-            distance=distance,
-            height=height,
-            grasped=held,
-            success=success,
-            lift=config.lift,
-        )
+        after = self._situation(physics.poses, ctrl)
+        after = dataclasses.replace(after, grasped=after.grasped & ~physics.diverged)
+        success = after.grasped & (after.height >= config.lift)
+        before = self._situation(state.physics.poses, state.ctrl)
+        terms = reward_terms(config.reward, before, after, success, config.lift)
         state = dataclasses.replace(
             state, physics=physics, ctrl=ctrl, step=state.step + 1, success=success
         )
         info = {
-            "grasped": held,
+            "grasped": after.grasped,
             "success": success,
             "diverged": physics.diverged,
-            "height": height,
-            "distance": distance,
+            "height": after.height,
+            "distance": after.distance,
             **{f"reward_{name}": term for name, term in terms.items()},
         }
         too_long = state.step >= config.max_steps
@@ -188,6 +179,15 @@ class Env:
             terminated=success,
             truncated=(too_long | physics.diverged) & ~success,
             info=info,
+        )
+
+    def _situation(self, poses: Poses, ctrl: jax.Array) -> Situation:
+        ids = self.ids
+        cube = poses.geom_xpos[ids.cube_geom]
+        return Situation(
+            distance=jnp.sqrt(jnp.sum(jnp.square(poses.site_xpos[ids.grasp_site] - cube))),
+            height=cube[2] - np.float32(ids.cube_half_size),
+            grasped=grasped(self.scene.mj_model, ids, poses, ctrl),
         )
 
     def observe(self, state: EnvState) -> Observation:
