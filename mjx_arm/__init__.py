@@ -1,12 +1,16 @@
 """Train a robot arm from pixels by deep Q-learning, entirely on the device."""
 
+from mjx_arm.agent import Agent, load_agent
 from mjx_arm.auto_reset import AutoReset
-from mjx_arm.config import EnvConfig, RewardConfig
+from mjx_arm.config import PRESETS, EnvConfig, RewardConfig, TrainConfig
 from mjx_arm.env import Env, EnvState, make
+from mjx_arm.loop import make_train
 from mjx_arm.render import Appearance, default_appearance, make_renderer, rgb, segmentation
 from mjx_arm.scene import Scene, load_scene
 
 __all__ = [
+    "PRESETS",
+    "Agent",
     "Appearance",
     "AutoReset",
     "Env",
@@ -14,10 +18,13 @@ __all__ = [
     "EnvState",
     "RewardConfig",
     "Scene",
+    "TrainConfig",
     "default_appearance",
+    "load_agent",
     "load_scene",
     "make",
     "make_renderer",
+    "make_train",
     "rgb",
     "segmentation",
 ]

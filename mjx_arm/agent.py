@@ -1,4 +1,4 @@
-"""A trained agent: its configuration, network and parameters, read back from a run folder."""
+"""A trained agent in one file: its configuration, its network's parameters, and how it did."""
 
 from __future__ import annotations
 
@@ -7,17 +7,19 @@ import json
 import pathlib
 from typing import Any
 
+import flax.serialization
 import jax
 import jax.numpy as jnp
+import numpy as np
 
-from mjx_arm.checkpoint import load_tree, save_tree
 from mjx_arm.config import EnvConfig, TrainConfig
 from mjx_arm.dqn import DQN, epsilon_greedy
 from mjx_arm.env import Env, make_env
 from mjx_arm.loop import make_dqn
 
 _CONFIG = "config.json"
-_PARAMS = "params"
+_FORMAT = "mjx_arm agent 1"
+LAST, BEST = "last.agent", "best.agent"
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -29,12 +31,16 @@ class Agent:
       env: the environment to try it in.
       dqn: the algorithm, with the network.
       params: of the network.
+      env_steps: environment steps that it was trained for.
+      selection_rate: share of successes in the evaluation that selected it, or None.
     """
 
     config: TrainConfig
     env: Env
     dqn: DQN
     params: Any
+    env_steps: int
+    selection_rate: float | None
 
     def act(self, obs: jax.Array, key: jax.Array, epsilon: float = 0.0) -> jax.Array:
         """Chooses an action.
@@ -52,7 +58,7 @@ class Agent:
 
 def save_config(folder: pathlib.Path, config: TrainConfig) -> None:
     """Writes `config.json`."""
-    (folder / _CONFIG).write_text(json.dumps(dataclasses.asdict(config), indent=2) + "\n")
+    (folder / _CONFIG).write_text(_dump_config(config) + "\n")
 
 
 def load_config(folder: pathlib.Path) -> TrainConfig:
@@ -64,43 +70,123 @@ def load_config(folder: pathlib.Path) -> TrainConfig:
     path = folder / _CONFIG
     if not path.is_file():
         raise ValueError(f"{folder} is no run folder: it has no {_CONFIG}")
+    return _parse_config(path.read_text(), path)
+
+
+def save_agent(
+    path: pathlib.Path,
+    config: TrainConfig,
+    params: Any,
+    *,
+    env_steps: int,
+    selection_rate: float | None = None,
+) -> None:
+    """Writes an agent to one file: whole, or not at all.
+
+    Raises:
+      ValueError: the disk is full, or the folder cannot be written.
+    """
+    content = {
+        "format": _FORMAT,
+        "config": _dump_config(config),
+        "env_steps": env_steps,
+        "selection_rate": selection_rate,
+        "params": flax.serialization.to_state_dict(jax.device_get(params)),
+    }
+    part = path.with_name(f"{path.name}.part")
     try:
-        values = json.loads(path.read_text())
-        values = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
-        return TrainConfig(**values)
-    except (TypeError, json.JSONDecodeError) as error:
-        raise ValueError(f"{path} is not the configuration of a run: {error}") from error
-
-
-def save_agent_params(folder: pathlib.Path, params: Any) -> None:
-    """Writes the parameters of a run folder's agent."""
-    save_tree(folder / _PARAMS, params)
+        part.write_bytes(flax.serialization.msgpack_serialize(content))
+        part.replace(path)
+    except OSError as error:
+        part.unlink(missing_ok=True)
+        raise ValueError(f"{path} could not be written: {error.strerror}") from error
 
 
 def load_agent(
-    folder: str | pathlib.Path, *, max_steps: int = EnvConfig.max_steps, **options: Any
+    path: str | pathlib.Path, *, max_steps: int = EnvConfig.max_steps, **options: Any
 ) -> Agent:
     """Reads a trained agent, with the environment to try it in.
 
     In environment B that is one where the cube moves after every episode, failed ones included.
 
     Args:
-      folder: a run folder.
+      path: an agent's file, or a run folder, of which the best agent is taken, or the last one
+        where none was selected.
       max_steps: iterations until an episode is truncated, whatever it was in training.
       **options: fields of `TrainConfig` to change, such as `physics` or `env`.
 
     Raises:
-      ValueError: the folder holds no agent, or an option does not fit.
+      ValueError: there is no agent, or it is damaged, or an option does not fit.
     """
-    folder = pathlib.Path(folder)
-    config = dataclasses.replace(load_config(folder), **options)
-    trained_in = config.env_config()
-    moves = trained_in.cube_moves if trained_in.cube_moves == "never" else "always"
-    env = make_env(dataclasses.replace(trained_in, cube_moves=moves, max_steps=max_steps))
+    path = find_agent(pathlib.Path(path))
+    content = _read(path)
+    config = dataclasses.replace(_parse_config(content["config"], path), **options)
+    env = evaluation_env(config, max_steps)
     dqn = make_dqn(config, env)
 
     def init() -> Any:
         obs, _ = env.reset(jax.random.key(0))
         return dqn.init_params(jax.random.key(0), jax.tree.map(lambda x: x[None], obs))
 
-    return Agent(config, env, dqn, load_tree(folder / _PARAMS, jax.eval_shape(init)))
+    like = jax.eval_shape(init)
+    try:
+        params = flax.serialization.from_state_dict(like, content["params"])
+    except ValueError as error:
+        raise ValueError(f"{path} holds the parameters of another network") from error
+    if jax.tree.map(np.shape, params) != jax.tree.map(np.shape, like):
+        raise ValueError(f"{path} holds the parameters of another network")
+    params = jax.tree.map(jnp.asarray, params)
+    return Agent(config, env, dqn, params, content["env_steps"], content["selection_rate"])
+
+
+def evaluation_env(config: TrainConfig, max_steps: int = EnvConfig.max_steps) -> Env:
+    """The environment to try an agent in: as in training, but for what training makes easier."""
+    trained_in = config.env_config()
+    moves = trained_in.cube_moves if trained_in.cube_moves == "never" else "always"
+    return make_env(dataclasses.replace(trained_in, cube_moves=moves, max_steps=max_steps))
+
+
+def find_agent(path: pathlib.Path) -> pathlib.Path:
+    """The agent's file that a path means.
+
+    Raises:
+      ValueError: there is none.
+    """
+    if path.is_file():
+        return path
+    for name in (BEST, LAST):
+        if (path / name).is_file():
+            return path / name
+    if (path / _CONFIG).is_file():
+        seeds = ", ".join(sorted(str(seed) for seed in path.glob("seed-*")))
+        hint = f"give one of {seeds}" if seeds else "the run has not saved one yet"
+        raise ValueError(f"{path} holds no agent: {hint}")
+    raise ValueError(f"{path} is no run folder and no agent: give one that `train` has made")
+
+
+def read_selection_rate(path: pathlib.Path) -> float | None:
+    """The share of successes with which an agent's file was selected, or None."""
+    return _read(path)["selection_rate"] if path.is_file() else None
+
+
+def _read(path: pathlib.Path) -> dict[str, Any]:
+    try:
+        content = flax.serialization.msgpack_restore(path.read_bytes())
+    except Exception as error:  # msgpack raises a dozen kinds for a file that is none of its own
+        raise ValueError(f"{path} is not the file of an agent, or a damaged one") from error
+    if not isinstance(content, dict) or content.get("format") != _FORMAT:
+        raise ValueError(f"{path} is not the file of an agent of this version")
+    return content
+
+
+def _dump_config(config: TrainConfig) -> str:
+    return json.dumps(dataclasses.asdict(config), indent=2)
+
+
+def _parse_config(text: str, path: pathlib.Path) -> TrainConfig:
+    try:
+        values = json.loads(text)
+        values = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
+        return TrainConfig(**values)
+    except (AttributeError, TypeError, json.JSONDecodeError) as error:
+        raise ValueError(f"{path} has not the configuration of a run: {error}") from error

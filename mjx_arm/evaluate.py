@@ -58,16 +58,10 @@ class _Run:
     totals: dict[str, jax.Array]
 
 
-def evaluate(
-    env: Env,
-    apply: Callable[[Any, jax.Array], jax.Array],
-    params: Any,
-    *,
-    episodes: int,
-    epsilon: float,
-    seed: int,
-) -> Evaluation:
-    """Runs an epsilon-greedy policy for a number of episodes.
+def make_evaluator(
+    env: Env, apply: Callable[[Any, jax.Array], jax.Array], *, episodes: int, epsilon: float
+) -> Callable[[Any, int], Evaluation]:
+    """Makes `(params, seed) -> Evaluation`, which runs an epsilon-greedy policy; compiles once.
 
     Each environment runs a number of episodes that is fixed beforehand, to their ends: the first
     so many to finish would favour short ones, and with them successes.
@@ -75,10 +69,11 @@ def evaluate(
     Args:
       env: made with the observation that the network wants.
       apply: `(params, obs [N, ...]) -> Q-values [N, A]`.
-      params: of the network.
       episodes: how many.
       epsilon: share of random actions.
-      seed: of starts and random actions.
+
+    Returns:
+      A function of the network's parameters and of a seed for starts and random actions.
 
     Raises:
       ValueError: `episodes` below 1, or `epsilon` outside 0 to 1.
@@ -94,20 +89,38 @@ def evaluate(
         return jax.lax.fori_loop(0, _CHUNK, lambda _, run: step(run), run)
 
     advance = jax.jit(advance_run, compiler_options=compiler_options(env.physics))
-    run = jax.jit(functools.partial(_start, auto, episodes))(jax.random.key(seed))
-    while int(jnp.max(run.left)) > 0:
-        run = advance(params, run)
-    totals = {name: int(total) for name, total in run.totals.items()}
-    assert totals["episodes"] == episodes
-    return Evaluation(
-        episodes=episodes,
-        successes=totals["successes"],
-        rate=totals["successes"] / episodes,
-        ci95=wilson_interval(totals["successes"], episodes),
-        mean_length=totals["length"] / episodes,
-        grasp_rate=totals["grasped"] / episodes,
-        regrasps=totals["regrasps"] / episodes,
-    )
+    start = jax.jit(functools.partial(_start, auto, episodes))
+
+    def evaluate_params(params: Any, seed: int) -> Evaluation:
+        run = start(jax.random.key(seed))
+        while int(jnp.max(run.left)) > 0:
+            run = advance(params, run)
+        totals = {name: int(total) for name, total in run.totals.items()}
+        assert totals["episodes"] == episodes
+        return Evaluation(
+            episodes=episodes,
+            successes=totals["successes"],
+            rate=totals["successes"] / episodes,
+            ci95=wilson_interval(totals["successes"], episodes),
+            mean_length=totals["length"] / episodes,
+            grasp_rate=totals["grasped"] / episodes,
+            regrasps=totals["regrasps"] / episodes,
+        )
+
+    return evaluate_params
+
+
+def evaluate(
+    env: Env,
+    apply: Callable[[Any, jax.Array], jax.Array],
+    params: Any,
+    *,
+    episodes: int,
+    epsilon: float,
+    seed: int,
+) -> Evaluation:
+    """Runs one policy once; see `make_evaluator`."""
+    return make_evaluator(env, apply, episodes=episodes, epsilon=epsilon)(params, seed)
 
 
 def _start(auto: AutoReset, episodes: int, key: jax.Array) -> _Run:

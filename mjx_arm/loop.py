@@ -62,6 +62,8 @@ class Trainer:
       init: `key -> LoopState`.
       run_chunk: `LoopState -> (LoopState, Counts)`, compiled; donates its argument. The counts are
         those of the chunk.
+
+    With `num_seeds` above 1 keys, states and counts have a leading axis of seeds.
     """
 
     config: TrainConfig
@@ -77,23 +79,52 @@ def make_trainer(config: TrainConfig) -> Trainer:
     Raises:
       ValueError: the environment cannot be made.
     """
-    env = make_env(config.env_config())
-    body = _Body(config, AutoReset(env), make_dqn(config, env), _make_storage(config, env))
-
-    def run_chunk(state: LoopState) -> tuple[LoopState, Counts]:
-        state = dataclasses.replace(state, counts=jax.tree.map(jnp.zeros_like, state.counts))
-        state, _ = jax.lax.scan(body.step, state, None, length=config.chunk_length)
-        return state, state.counts
-
+    body = _make_body(config)
+    init, run_chunk = body.init, body.run_chunk
+    if config.num_seeds > 1:
+        init, run_chunk = jax.vmap(init), jax.vmap(run_chunk)
+    env = body.env.env
     return Trainer(
         config=config,
         env=env,
         dqn=body.dqn,
-        init=jax.jit(body.init),
+        init=jax.jit(init),
         run_chunk=jax.jit(
             run_chunk, donate_argnums=0, compiler_options=compiler_options(env.physics)
         ),
     )
+
+
+def make_train(config: TrainConfig) -> Callable[[jax.Array], tuple[LoopState, Counts]]:
+    """Makes a whole training run as one function, for use from Python.
+
+    It writes no files and never looks at the clock; `mjx_arm.train` does.
+
+    Args:
+      config: the options; `seed` and `num_seeds` have no meaning here.
+
+    Returns:
+      `train(key) -> (state, counts)`: the state after the last step, and the counts of each chunk,
+      `[chunks]` each. Pure; may be jitted, and vmapped over keys.
+
+    Raises:
+      ValueError: the environment cannot be made.
+    """
+    body = _make_body(config)
+
+    def train(key: jax.Array) -> tuple[LoopState, Counts]:
+        return jax.lax.scan(
+            lambda state, _: body.run_chunk(state), body.init(key), None, length=config.num_chunks
+        )
+
+    return train
+
+
+def run_keys(config: TrainConfig) -> jax.Array:
+    """The key that a run starts from, or with several seeds those of all, `[S]`."""
+    if config.num_seeds == 1:
+        return jax.random.key(config.seed)
+    return jax.vmap(jax.random.key)(config.seed + jnp.arange(config.num_seeds))
 
 
 def make_dqn(config: TrainConfig, env: Env) -> DQN:
@@ -147,9 +178,14 @@ def _make_storage(config: TrainConfig, env: Env) -> _Storage:
     return _Storage(store=lambda envs, obs: envs.env.physics.qpos, restore=jax.vmap(draw))
 
 
+def _make_body(config: TrainConfig) -> _Body:
+    env = make_env(config.env_config())
+    return _Body(config, AutoReset(env), make_dqn(config, env), _make_storage(config, env))
+
+
 @dataclasses.dataclass(frozen=True)
 class _Body:
-    """The body of the scan."""
+    """The body of the scan, for one seed."""
 
     config: TrainConfig
     env: AutoReset
@@ -184,6 +220,11 @@ class _Body:
         counts = jax.eval_shape(lambda s: self.step(s, None)[0].counts, state)
         zeros = {name: jnp.zeros(x.shape, x.dtype) for name, x in counts.items()}
         return dataclasses.replace(state, counts=zeros)
+
+    def run_chunk(self, state: LoopState) -> tuple[LoopState, Counts]:
+        state = dataclasses.replace(state, counts=jax.tree.map(jnp.zeros_like, state.counts))
+        state, _ = jax.lax.scan(self.step, state, None, length=self.config.chunk_length)
+        return state, state.counts
 
     def step(self, state: LoopState, _: None) -> tuple[LoopState, None]:
         key, act_key, env_key, learn_key = jax.random.split(state.key, 4)

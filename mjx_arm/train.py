@@ -2,31 +2,47 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
+import math
 import pathlib
 import signal
 import time
+from collections.abc import Callable
 from types import FrameType, TracebackType
-from typing import Self
+from typing import Any, Self
 
 import jax
 from rich.console import Console
 
-from mjx_arm.agent import load_agent, load_config, save_agent_params, save_config
+from mjx_arm.agent import (
+    BEST,
+    LAST,
+    evaluation_env,
+    find_agent,
+    load_agent,
+    load_config,
+    read_selection_rate,
+    save_agent,
+    save_config,
+)
 from mjx_arm.checkpoint import RunCheckpoints
 from mjx_arm.config import TrainConfig
-from mjx_arm.evaluate import Evaluation, evaluate
-from mjx_arm.loop import LoopState, Trainer, make_trainer, summarise
+from mjx_arm.evaluate import Evaluation, evaluate, make_evaluator
+from mjx_arm.loop import Counts, LoopState, Trainer, make_trainer, run_keys, summarise
 from mjx_arm.memory import check_memory, memory_plan
 from mjx_arm.report.figures import plot_curves
 from mjx_arm.report.metrics import MetricsWriter, keep_metrics
 from mjx_arm.report.progress import describe, make_progress, say_device, say_memory
 from mjx_arm.report.video import draw_episode, record_episode, write_video
 
-# Held out: training draws its keys from the run's own seed.
+# Held out: training draws its keys from the run's own seed, and what selects an agent does not
+# judge it.
+_SELECTION_SEED = 2_000_003
 _EVALUATION_SEED = 1_000_003
 _EVALUATION_EPSILON = 0.1
+Evaluate = Callable[[Any, int], Evaluation]
 # Chunks between two checkpoints.
 _SAVE_EVERY = 10
 
@@ -37,8 +53,10 @@ class RunInterruptedError(Exception):
 
 def train(
     config: TrainConfig, folder: pathlib.Path, *, eval_episodes: int, console: Console
-) -> Evaluation:
-    """Trains an agent and leaves metrics, curves, parameters, an evaluation and a video.
+) -> list[Evaluation]:
+    """Trains an agent and leaves metrics, curves, agents, an evaluation and a video.
+
+    With several seeds each has all this in a folder of its own, `seed-0` and so on.
 
     Args:
       config: the options.
@@ -47,7 +65,7 @@ def train(
       console: where it speaks.
 
     Returns:
-      The evaluation.
+      The evaluation of each seed.
 
     Raises:
       ValueError: the options do not fit the machine, or the folder cannot be used.
@@ -55,9 +73,9 @@ def train(
     """
     trainer = _prepare(config, console)
     prepare_folder(folder)
-    save_config(folder, config)
-    _run(trainer, trainer.init(jax.random.key(config.seed)), 0, folder, console)
-    return _finish(folder, eval_episodes, console)
+    _save_configs(folder, config)
+    _run(trainer, trainer.init(run_keys(config)), 0, folder, console)
+    return _finish(folder, config, eval_episodes, console)
 
 
 def resume(
@@ -66,7 +84,7 @@ def resume(
     total_steps: int | None = None,
     eval_episodes: int,
     console: Console,
-) -> Evaluation:
+) -> list[Evaluation]:
     """Goes on with a run from its newest checkpoint, as if it had never stopped.
 
     On the CPU, on the same machine and with as many threads, every bit is that of a run without the
@@ -86,22 +104,89 @@ def resume(
     if total_steps is not None:
         config = dataclasses.replace(config, total_steps=total_steps)
     trainer = _prepare(config, console)
-    like = jax.eval_shape(trainer.init, jax.random.key(config.seed))
+    like = jax.eval_shape(trainer.init, run_keys(config))
     state, vector_step = RunCheckpoints(folder).load_newest(like)
-    save_config(folder, config)
-    keep_metrics(folder, vector_step * config.num_envs)
+    _save_configs(folder, config)
+    for seed_folder in seed_folders(folder, config):
+        keep_metrics(seed_folder, vector_step * config.num_envs)
     console.print(f"going on after {vector_step * config.num_envs:,} steps")
     _run(trainer, state, vector_step // config.chunk_length, folder, console)
-    return _finish(folder, eval_episodes, console)
+    return _finish(folder, config, eval_episodes, console)
 
 
 def _prepare(config: TrainConfig, console: Console) -> Trainer:
     say_device(console)
     trainer = make_trainer(config)
-    plan = memory_plan(jax.eval_shape(trainer.init, jax.random.key(config.seed)))
+    plan = memory_plan(jax.eval_shape(trainer.init, run_keys(config)))
     say_memory(console, plan)
     check_memory(plan)
     return trainer
+
+
+def seed_folders(folder: pathlib.Path, config: TrainConfig) -> list[pathlib.Path]:
+    """Where the results of each seed go."""
+    if config.num_seeds == 1:
+        return [folder]
+    return [folder / f"seed-{config.seed + i}" for i in range(config.num_seeds)]
+
+
+def _seed_configs(config: TrainConfig) -> list[TrainConfig]:
+    """The configuration of each seed's own run."""
+    return [
+        dataclasses.replace(config, seed=config.seed + i, num_seeds=1)
+        for i in range(config.num_seeds)
+    ]
+
+
+def _save_configs(folder: pathlib.Path, config: TrainConfig) -> None:
+    save_config(folder, config)
+    if config.num_seeds > 1:
+        pairs = zip(seed_folders(folder, config), _seed_configs(config), strict=True)
+        for seed_folder, seed_config in pairs:
+            seed_folder.mkdir(exist_ok=True)
+            save_config(seed_folder, seed_config)
+
+
+def _of_seed(tree: Any, config: TrainConfig, i: int) -> Any:
+    return tree if config.num_seeds == 1 else jax.tree.map(lambda x: x[i], tree)
+
+
+class _Results:
+    """What the chunks of one seed leave on disk: metrics, the last agent, and the best one."""
+
+    def __init__(self, folder: pathlib.Path, config: TrainConfig, evaluate_params: Evaluate):
+        self.folder, self.config = folder, config
+        self._evaluate = evaluate_params
+        self._best = read_selection_rate(folder / BEST)
+        self.writer = MetricsWriter(folder)
+
+    def add(
+        self, counts: Counts, params: Any, chunk: int, *, seconds: float, select: bool
+    ) -> dict[str, float]:
+        """Writes the metrics of a chunk, the selection's included, and returns them."""
+        metrics = summarise(self.config, counts, chunk * self.config.chunk_length)
+        per_chunk = self.config.chunk_length * self.config.num_envs
+        metrics["steps_per_s"] = per_chunk / seconds
+        metrics["selection_rate"] = math.nan
+        if select:
+            metrics["selection_rate"] = self._select(params, int(metrics["env_steps"]))
+        self.writer.write(metrics)
+        return metrics
+
+    def _select(self, params: Any, env_steps: int) -> float:
+        rate = self._evaluate(params, _SELECTION_SEED).rate
+        # The later of two equal ones: it has seen more.
+        if self._best is None or rate >= self._best:
+            self._best = rate
+            self._save(BEST, params, env_steps, rate)
+        return rate
+
+    def save_last(self, params: Any, env_steps: int) -> None:
+        self._save(LAST, params, env_steps, None)
+
+    def _save(self, name: str, params: Any, env_steps: int, rate: float | None) -> None:
+        path = self.folder / name
+        save_agent(path, self.config, params, env_steps=env_steps, selection_rate=rate)
 
 
 def _run(
@@ -109,26 +194,49 @@ def _run(
 ) -> None:
     config, checkpoints = trainer.config, RunCheckpoints(folder)
     per_chunk = config.chunk_length * config.num_envs
-    chunks = -(-config.total_steps // per_chunk)
+    chunks = config.num_chunks
+    evaluate_params = make_evaluator(
+        evaluation_env(config),
+        trainer.dqn.apply,
+        episodes=config.select_episodes,
+        epsilon=_EVALUATION_EPSILON,
+    )
     console.print("compiling; the first chunk takes longer")
-    with (
-        _Interruption() as interruption,
-        MetricsWriter(folder) as writer,
-        make_progress(console) as progress,
-    ):
+    with contextlib.ExitStack() as stack:
+        interruption = stack.enter_context(_Interruption())
+        progress = stack.enter_context(make_progress(console))
+        pairs = zip(seed_folders(folder, config), _seed_configs(config), strict=True)
+        results = [_Results(*pair, evaluate_params) for pair in pairs]
+        for result in results:
+            stack.enter_context(result.writer)
         task = progress.add_task("", total=chunks * per_chunk, metrics="")
         for chunk in range(done + 1, chunks + 1):
             started = time.perf_counter()
             state, counts = trainer.run_chunk(state)
-            metrics = summarise(config, jax.device_get(counts), chunk * config.chunk_length)
-            metrics["steps_per_s"] = per_chunk / (time.perf_counter() - started)
-            writer.write(metrics)
-            progress.update(task, completed=chunk * per_chunk, metrics=describe(metrics))
-            if chunk == chunks or chunk % _SAVE_EVERY == 0 or interruption.asked:
+            counts = jax.device_get(counts)
+            seconds = time.perf_counter() - started
+            last = chunk == chunks
+            select = config.select_every > 0 and (last or _is_due(config, chunk))
+            params = [_of_seed(state.learner.params, config, i) for i in range(len(results))]
+            rows = [
+                result.add(
+                    _of_seed(counts, config, i), params[i], chunk, seconds=seconds, select=select
+                )
+                for i, result in enumerate(results)
+            ]
+            progress.update(task, completed=chunk * per_chunk, metrics=describe(rows))
+            if last or chunk % _SAVE_EVERY == 0 or interruption.asked:
                 checkpoints.save(chunk * config.chunk_length, state)
-                save_agent_params(folder, state.learner.params)
-            if interruption.asked and chunk < chunks:
+                for result, own in zip(results, params, strict=True):
+                    result.save_last(own, chunk * per_chunk)
+            if interruption.asked and not last:
                 raise RunInterruptedError(f"saved; go on with: python train.py --resume {folder}")
+
+
+def _is_due(config: TrainConfig, chunk: int) -> bool:
+    """Whether a selection falls into this chunk."""
+    per_chunk = config.chunk_length * config.num_envs
+    return chunk * per_chunk // config.select_every > (chunk - 1) * per_chunk // config.select_every
 
 
 class _Interruption:
@@ -155,10 +263,21 @@ class _Interruption:
         self.asked = True
 
 
-def _finish(folder: pathlib.Path, eval_episodes: int, console: Console) -> Evaluation:
-    for path in plot_curves(folder):
+def _finish(
+    folder: pathlib.Path, config: TrainConfig, eval_episodes: int, console: Console
+) -> list[Evaluation]:
+    folders = seed_folders(folder, config)
+    if len(folders) > 1:
+        for path in plot_curves(folders, into=folder):
+            console.print(f"curves: {path}")
+    return [_finish_seed(own, eval_episodes, console) for own in folders]
+
+
+def _finish_seed(folder: pathlib.Path, eval_episodes: int, console: Console) -> Evaluation:
+    for path in plot_curves([folder], into=folder):
         console.print(f"curves: {path}")
     agent = load_agent(folder)
+    console.print(f"agent: {find_agent(folder)}, after {agent.env_steps:,} steps")
     result = evaluate(
         agent.env,
         agent.dqn.apply,

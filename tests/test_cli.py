@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import dataclasses
 import json
 import pathlib
 import subprocess
@@ -13,12 +14,14 @@ import pytest
 
 from mjx_arm.agent import load_agent, load_config
 from mjx_arm.cli import main
+from mjx_arm.config import PRESETS, TrainConfig
 from mjx_arm.report.metrics import read_metrics
 
 TINY = [
     *("--physics", "native", "--num-envs", "4", "--size", "16", "16", "--replay-size", "400"),
     *("--batch-size", "8", "--learning-starts", "40", "--chunk-steps", "200"),
     *("--total-steps", "400", "--max-steps", "25", "--hidden", "16", "--eval-episodes", "6"),
+    *("--select-every", "200", "--select-episodes", "3"),
 ]
 
 
@@ -32,7 +35,8 @@ def run_folder(tmp_path_factory) -> pathlib.Path:
 def test_a_run_leaves_everything(run_folder):
     names = {path.name for path in run_folder.iterdir()}
     assert names == {
-        *("config.json", "metrics.jsonl", "tensorboard", "params", "evaluation.json"),
+        *("config.json", "metrics.jsonl", "tensorboard", "evaluation.json"),
+        *("last.agent", "best.agent"),
         *("checkpoints",),
         *("figure3.png", "learning.png", "policy.mp4"),
     }
@@ -85,22 +89,32 @@ def test_the_agent_acts(run_folder):
         (["--reward", "candy"], "unknown reward 'candy'"),
         (["--scene", "kitchen"], "unknown scene 'kitchen'"),
         (["--size", "0", "64"], "size is (0, 64)"),
+        (["--preset", "slow"], "unknown preset 'slow'"),
+        (["--preset"], "unknown preset None"),
+        (["--colour", "red"], "unknown options: --colour, red"),
+        (["--num-envs", "many"], "--num-envs: invalid literal for int()"),
+        (["--num-seeds", "0"], "num_seeds is 0"),
+        (["--select-every", "-1"], "select_every is -1"),
     ],
 )
 def test_bad_input_gets_one_sentence_and_status_2(arguments, message, capsys, tmp_path):
     folder = tmp_path / "run"
-    assert main(["train", *arguments, "--out", str(folder)]) == 2
+    assert main(["train", "--out", str(folder), *arguments]) == 2
     error = capsys.readouterr().err
     assert message in error
     assert error.count("\n") == 1
     assert not folder.exists()
 
 
-def test_an_unknown_option_gets_status_2(capsys):
+@pytest.mark.parametrize("preset", ["fast", "smoke", "paper"])
+def test_help_shows_the_values_of_the_preset(preset, capsys):
     with pytest.raises(SystemExit) as exit_info:
-        main(["train", "--colour", "red"])
-    assert exit_info.value.code == 2
-    assert "--colour" in capsys.readouterr().err
+        main(["train", "--preset", preset, "--help"])
+    assert exit_info.value.code == 0
+    text = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    for field in dataclasses.fields(TrainConfig):
+        assert f"--{field.name.replace('_', '-')}" in text
+    assert f"(default: {PRESETS[preset].total_steps})" in text
 
 
 def test_warp_without_its_extra_is_refused(capsys, tmp_path):
@@ -168,3 +182,41 @@ def test_what_is_no_run_is_refused(command, tmp_path, capsys):
     error = capsys.readouterr().err
     assert "is no run folder" in error
     assert error.count("\n") == 1
+
+
+@pytest.mark.parametrize("command", ["eval", "play"])
+@pytest.mark.parametrize("damage", ["short", "foreign", "other network"])
+def test_a_file_that_is_no_agent_is_refused(command, damage, run_folder, tmp_path, capsys):
+    path = tmp_path / "some.agent"
+    content = (run_folder / "best.agent").read_bytes()
+    if damage == "short":
+        path.write_bytes(content[:-1000])
+    elif damage == "foreign":
+        path.write_bytes(b"PK\x03\x04 nothing of ours")
+    else:
+        path.write_bytes(content.replace(b'"hidden": 16', b'"hidden": 32'))
+    assert main([command, str(path)]) == 2
+    error = capsys.readouterr().err
+    assert str(path) in error
+    assert error.count("\n") == 1
+
+
+def test_the_best_agent_is_the_one_that_selection_found(run_folder):
+    best, last = load_agent(run_folder), load_agent(run_folder / "last.agent")
+    rates = {row["env_steps"]: row["selection_rate"] for row in read_metrics(run_folder)}
+    assert rates == {200: 0.0, 400: 0.0}
+    assert (best.selection_rate, best.env_steps) == (0.0, 400)
+    assert (last.selection_rate, last.env_steps) == (None, 400)
+
+
+def test_seeds_have_folders_of_their_own(tmp_path, capsys):
+    folder = tmp_path / "run"
+    assert main(["train", *TINY, "--num-seeds", "2", "--seed", "3", "--out", str(folder)]) == 0
+    for seed in (3, 4):
+        own = folder / f"seed-{seed}"
+        assert load_config(own).seed == seed
+        assert len(read_metrics(own)) == 2
+        assert load_agent(own).env_steps == 400
+    assert np.asarray(imageio.imread(folder / "figure3.png")).std() > 5
+    assert main(["eval", str(folder), "--episodes", "2"]) == 2
+    assert "seed-3" in capsys.readouterr().err

@@ -9,7 +9,7 @@ import pytest
 
 import mjx_arm
 from mjx_arm.config import TrainConfig
-from mjx_arm.loop import epsilon_at, make_trainer, summarise
+from mjx_arm.loop import epsilon_at, make_train, make_trainer, run_keys, summarise
 
 CONFIG = TrainConfig(
     physics="native",
@@ -34,7 +34,7 @@ def bits(tree):
 
 def train(config: TrainConfig, chunks: int = 3):
     trainer = make_trainer(config)
-    state = trainer.init(jax.random.key(config.seed))
+    state = trainer.init(run_keys(config))
     rows = []
     for chunk in range(1, chunks + 1):
         state, counts = trainer.run_chunk(state)
@@ -123,6 +123,33 @@ def test_epsilon_falls_linearly(steps, expected):
 def test_state_features_train_too():
     _, _, rows = train(dataclasses.replace(CONFIG, observation="state"), chunks=1)
     assert rows[0]["updates"] > 0
+
+
+@pytest.mark.parametrize("storage", ["states", "pixels"])
+def test_seeds_side_by_side_are_the_runs_one_by_one(storage):
+    config = dataclasses.replace(CONFIG, storage=storage)
+    _, both, _ = train(dataclasses.replace(config, num_seeds=2), chunks=0)
+    trainer = make_trainer(dataclasses.replace(config, num_seeds=2))
+    both, counts = trainer.run_chunk(both)
+    for seed in (0, 1):
+        _, alone, _ = train(dataclasses.replace(config, seed=seed), chunks=1)
+        np.testing.assert_array_equal(both.replay.steps.action[seed], alone.replay.steps.action)
+        for a, b in zip(
+            jax.tree.leaves(both.learner.params), jax.tree.leaves(alone.learner.params), strict=True
+        ):
+            np.testing.assert_allclose(a[seed], b, atol=1e-4)
+    assert counts["updates"].shape == (2,)
+
+
+def test_a_whole_run_is_one_function(run):
+    _, state, rows = run
+    total = 3 * CONFIG.chunk_length * CONFIG.num_envs
+    final, counts = jax.jit(make_train(dataclasses.replace(CONFIG, total_steps=total)))(
+        jax.random.key(CONFIG.seed)
+    )
+    assert counts["updates"].tolist() == [row["updates"] for row in rows]
+    for a, b in zip(bits(final.learner.params), bits(state.learner.params), strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-5)
 
 
 def test_configuration_is_never_mutated(run):

@@ -2,60 +2,73 @@
 
 from __future__ import annotations
 
+import itertools
 import pathlib
+from collections.abc import Sequence
 
 import numpy as np
 from matplotlib.figure import Figure
 
 from mjx_arm.report.metrics import read_metrics
 
-_COLOUR = "#1f5fa8"
+_COLOURS = ("#1f5fa8", "#c4572b", "#3b8f4f", "#7d4fa0", "#8a6d1d", "#2a8f96")
+_AXES = {"episode": "episode", "env_steps": "environment step"}
+_PAPER = {
+    "cumulative_successes": "cumulative successes",
+    "mean_reward": "mean reward",
+    "mean_max_q": "mean max Q",
+}
+_LEARNING = {
+    "success_rate": "success rate",
+    "grasp_share": "steps with the cube grasped",
+    "mean_distance": "distance gripper to cube (m)",
+    "loss": "loss",
+}
 
 
-def plot_curves(folder: pathlib.Path) -> list[pathlib.Path]:
-    """Draws the curves of a run folder as PNG files into it.
+def plot_curves(folders: Sequence[pathlib.Path], into: pathlib.Path) -> list[pathlib.Path]:
+    """Draws the curves of run folders, one line each, as PNG files.
 
     `figure3.png` has the paper's three: cumulative successes, mean reward of a step and mean
     maximum Q of a step, over episodes. `learning.png` has success rate, share of steps with the
     cube grasped, distance between gripper and cube and loss, over environment steps.
 
+    Args:
+      folders: with metrics.
+      into: where the files go.
+
     Returns:
       Paths of the files.
 
     Raises:
-      ValueError: the folder holds no metrics.
+      ValueError: a folder holds no metrics.
     """
-    rows = read_metrics(folder)
-    column = {name: np.asarray([row[name] for row in rows]) for name in rows[0]}
-    episodes = np.cumsum(column["episodes"])
-    steps = column["env_steps"]
-    paper = [
-        ("cumulative successes", episodes, np.cumsum(column["successes"])),
-        ("mean reward", episodes, column["mean_reward"]),
-        ("mean max Q", episodes, column["mean_max_q"]),
-    ]
-    learning = [
-        ("success rate", steps, column["success_rate"]),
-        ("steps with the cube grasped", steps, column["grasp_share"]),
-        ("distance gripper to cube (m)", steps, column["mean_distance"]),
-        ("loss", steps, column["loss"]),
-    ]
+    runs = [_columns(folder) for folder in folders]
     return [
-        _draw(folder / "figure3.png", paper, "episode"),
-        _draw(folder / "learning.png", learning, "environment step"),
+        _draw(into / "figure3.png", _PAPER, "episode", runs),
+        _draw(into / "learning.png", _LEARNING, "env_steps", runs),
     ]
+
+
+def _columns(folder: pathlib.Path) -> dict[str, np.ndarray]:
+    rows = read_metrics(folder)
+    columns = {name: np.asarray([row[name] for row in rows]) for name in rows[0]}
+    columns["episode"] = np.cumsum(columns["episodes"])
+    columns["cumulative_successes"] = np.cumsum(columns["successes"])
+    return columns
 
 
 def _draw(
-    path: pathlib.Path, panels: list[tuple[str, np.ndarray, np.ndarray]], x_label: str
+    path: pathlib.Path, panels: dict[str, str], x_name: str, runs: list[dict[str, np.ndarray]]
 ) -> pathlib.Path:
     figure = Figure(figsize=(4.2 * len(panels), 3.2), layout="constrained")
-    for axes, (title, x, y) in zip(figure.subplots(1, len(panels)), panels, strict=True):
-        known = np.isfinite(y)
-        marker = "." if known.sum() < 30 else ""
-        axes.plot(x[known], y[known], color=_COLOUR, linewidth=1.4, marker=marker)
+    for axes, (name, title) in zip(figure.subplots(1, len(panels)), panels.items(), strict=True):
+        for run, colour in zip(runs, itertools.cycle(_COLOURS), strict=False):
+            known = np.isfinite(run[name])
+            marker = "." if known.sum() < 30 else ""
+            axes.plot(run[x_name][known], run[name][known], color=colour, lw=1.4, marker=marker)
         axes.set_title(title, fontsize=10)
-        axes.set_xlabel(x_label)
+        axes.set_xlabel(_AXES[x_name])
         axes.grid(alpha=0.3)
     figure.savefig(path, dpi=110)
     return path

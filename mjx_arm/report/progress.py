@@ -39,13 +39,14 @@ def make_progress(console: Console) -> Progress:
     )
 
 
-def describe(metrics: dict[str, float]) -> str:
-    """One line of a chunk's metrics."""
+def describe(rows: list[dict[str, float]]) -> str:
+    """One line of a chunk's metrics, means over the seeds."""
+    metrics = {name: sum(row[name] for row in rows) / len(rows) for name in rows[0]}
     parts = [
         f"{metrics['steps_per_s']:,.0f}/s",
         f"success {_percent(metrics['success_rate'])}",
         f"grasp {_percent(metrics['grasp_share'])}",
-        f"Q {metrics['q_mean']:.1f}",
+        f"max Q {metrics['q_mean']:.1f}",
         f"loss {metrics['loss']:.4f}",
         f"ε {metrics['epsilon']:.2f}",
     ]
