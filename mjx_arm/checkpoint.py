@@ -81,8 +81,22 @@ class RunCheckpoints:
         self._folder = folder / "checkpoints"
 
     def save(self, vector_step: int, state: Any) -> None:
-        """Writes a checkpoint, then removes all but the last two."""
-        save_tree(self._folder / f"{vector_step:0{_DIGITS}d}", state)
+        """Writes a checkpoint, then removes all but the last two.
+
+        Raises:
+          ValueError: it could not be written; names the newest whole one, if there is one.
+        """
+        path = self._folder / f"{vector_step:0{_DIGITS}d}"
+        try:
+            save_tree(path, state)
+        except ValueError as error:
+            shutil.rmtree(path, ignore_errors=True)
+            steps = self.steps()
+            if not steps:
+                raise
+            raise ValueError(
+                f"{error}; --resume goes on from {steps[-1]:0{_DIGITS}d}, which is whole"
+            ) from error
         for step in self.steps()[:-_KEPT]:
             shutil.rmtree(self._folder / f"{step:0{_DIGITS}d}")
 

@@ -206,7 +206,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the command line.
 
     Returns:
-      The exit status: 2 for input that does not fit, 130 for a run that was interrupted.
+      The exit status: 2 for input that does not fit or a disk that does not take the output, 130
+      for a run that was interrupted.
     """
     arguments = sys.argv[1:] if arguments is None else arguments
     names = (x[2:].split("=")[0] for x in arguments if x.startswith("--"))
@@ -215,6 +216,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         _parse(arguments).run(given)
     except ValueError as error:
         print(f"error: {error}", file=sys.stderr)
+        return 2
+    except OSError as error:
+        where = f"{error.filename}: " if error.filename else ""
+        print(f"error: {where}{error.strerror or error}", file=sys.stderr)
         return 2
     except RunInterruptedError as stop:
         print(stop, file=sys.stderr)

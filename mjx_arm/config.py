@@ -223,12 +223,12 @@ class TrainConfig:
     learning_starts: int = 5_000
     n_step: int = 3
     gamma: float = 0.99
-    learning_rate: float = 3e-4
+    learning_rate: float = 6e-4
     max_grad_norm: float = 10.0
     double: bool = True
     dueling: bool = True
     huber: bool = True
-    polyak: float = 0.002
+    polyak: float = 0.005
     target_period: int = 1_000
     epsilon_start: float = 1.0
     epsilon_end: float = 0.1

@@ -178,6 +178,22 @@ def _step(
     )
 
 
+def newcombe_interval(
+    successes: int, episodes: int, other_successes: int, other_episodes: int
+) -> tuple[float, float]:
+    """Newcombe's 95 % hybrid score interval of the difference of two shares (Newcombe 1998).
+
+    Of the first minus the second, from Wilson's intervals of both.
+    """
+    p, q = successes / episodes, other_successes / other_episodes
+    p_low, p_high = wilson_interval(successes, episodes)
+    q_low, q_high = wilson_interval(other_successes, other_episodes)
+    return (
+        p - q - math.hypot(p - p_low, q_high - q),
+        p - q + math.hypot(p_high - p, q - q_low),
+    )
+
+
 def wilson_interval(successes: int, episodes: int) -> tuple[float, float]:
     """Wilson's 95 % score interval of a share (Wilson 1927): lower and upper bound."""
     rate, z2 = successes / episodes, _WILSON_Z**2

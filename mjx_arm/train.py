@@ -33,7 +33,7 @@ from mjx_arm.evaluate import Evaluation, evaluate, make_evaluator
 from mjx_arm.loop import Counts, LoopState, Trainer, make_trainer, run_keys, summarise
 from mjx_arm.memory import check_memory, memory_plan
 from mjx_arm.report.figures import plot_curves
-from mjx_arm.report.metrics import MetricsWriter, keep_metrics
+from mjx_arm.report.metrics import MetricsWriter, keep_metrics, last_wall_s
 from mjx_arm.report.progress import describe, make_progress, say_device, say_memory
 from mjx_arm.report.video import draw_episode, record_episode, write_video
 
@@ -154,10 +154,14 @@ def _of_seed(tree: Any, config: TrainConfig, i: int) -> Any:
 class _Results:
     """What the chunks of one seed leave on disk: metrics, the last agent, and the best one."""
 
-    def __init__(self, folder: pathlib.Path, config: TrainConfig, evaluate_params: Evaluate):
+    def __init__(
+        self, folder: pathlib.Path, config: TrainConfig, evaluate_params: Evaluate, started: float
+    ):
         self.folder, self.config = folder, config
         self._evaluate = evaluate_params
         self._best = read_selection_rate(folder / BEST)
+        self._wall_before = last_wall_s(folder)
+        self._started = started
         self.writer = MetricsWriter(folder)
 
     def add(
@@ -170,6 +174,7 @@ class _Results:
         metrics["selection_rate"] = math.nan
         if select:
             metrics["selection_rate"] = self._select(params, int(metrics["env_steps"]))
+        metrics["wall_s"] = self._wall_before + time.perf_counter() - self._started
         self.writer.write(metrics)
         return metrics
 
@@ -192,7 +197,7 @@ class _Results:
 def _run(
     trainer: Trainer, state: LoopState, done: int, folder: pathlib.Path, console: Console
 ) -> None:
-    config, checkpoints = trainer.config, RunCheckpoints(folder)
+    config, checkpoints, started = trainer.config, RunCheckpoints(folder), time.perf_counter()
     per_chunk = config.chunk_length * config.num_envs
     chunks = config.num_chunks
     evaluate_params = make_evaluator(
@@ -206,18 +211,19 @@ def _run(
         interruption = stack.enter_context(_Interruption())
         progress = stack.enter_context(make_progress(console))
         pairs = zip(seed_folders(folder, config), _seed_configs(config), strict=True)
-        results = [_Results(*pair, evaluate_params) for pair in pairs]
+        results = [_Results(*pair, evaluate_params, started) for pair in pairs]
         for result in results:
             stack.enter_context(result.writer)
         task = progress.add_task("", total=chunks * per_chunk, metrics="")
         for chunk in range(done + 1, chunks + 1):
-            started = time.perf_counter()
+            before = time.perf_counter()
             state, counts = trainer.run_chunk(state)
             counts = jax.device_get(counts)
-            seconds = time.perf_counter() - started
+            seconds = time.perf_counter() - before
             last = chunk == chunks
             select = config.select_every > 0 and (last or _is_due(config, chunk))
-            params = [_of_seed(state.learner.params, config, i) for i in range(len(results))]
+            policy = trainer.dqn.policy(state.learner)
+            params = [_of_seed(policy, config, i) for i in range(len(results))]
             rows = [
                 result.add(
                     _of_seed(counts, config, i), params[i], chunk, seconds=seconds, select=select

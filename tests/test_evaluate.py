@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import mjx_arm
-from mjx_arm.evaluate import evaluate, wilson_interval
+from mjx_arm.evaluate import evaluate, newcombe_interval, wilson_interval
 from mjx_arm.task import NUM_ACTIONS, OPEN
 
 EPISODES = 1000
@@ -61,6 +61,13 @@ def test_wilson_interval_by_hand():
     assert wilson_interval(8, 10) == pytest.approx((0.4902, 0.9433), abs=1e-4)
     assert wilson_interval(0, 10)[0] == 0.0
     assert wilson_interval(10, 10)[1] == 1.0
+
+
+def test_newcombe_interval_is_that_of_the_paper():
+    # Newcombe 1998, table II, method 10.
+    assert newcombe_interval(56, 70, 48, 80) == pytest.approx((0.0524, 0.3339), abs=1e-4)
+    assert newcombe_interval(9, 10, 3, 10) == pytest.approx((0.1705, 0.8090), abs=1e-4)
+    assert newcombe_interval(5, 56, 0, 29) == pytest.approx((-0.0381, 0.1926), abs=1e-4)
 
 
 @pytest.mark.parametrize(("option", "value"), [("episodes", 0), ("epsilon", 1.5)])

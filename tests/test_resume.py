@@ -16,7 +16,7 @@ import jax
 import numpy as np
 import pytest
 
-from mjx_arm.agent import load_config
+from mjx_arm.agent import load_agent, load_config
 from mjx_arm.checkpoint import RunCheckpoints, load_tree, save_tree
 from mjx_arm.cli import main
 from mjx_arm.config import TrainConfig
@@ -27,6 +27,7 @@ OPTIONS = [
     *("--physics", "native", "--num-envs", "4", "--size", "16", "16", "--replay-size", "400"),
     *("--batch-size", "8", "--learning-starts", "40", "--chunk-steps", "200"),
     *("--max-steps", "25", "--hidden", "16", "--eval-episodes", "4"),
+    *("--select-every", "2000", "--select-episodes", "2"),
 ]
 TOTAL_STEPS = 8_000
 # Processes that are killed at a random moment each.
@@ -52,8 +53,16 @@ def assert_same_run(one: pathlib.Path, other: pathlib.Path) -> None:
     assert step == expected_step
     for a, b in zip(jax.tree.leaves(state), jax.tree.leaves(expected), strict=True):
         np.testing.assert_array_equal(a, b)
-    rows = [[{**row, "steps_per_s": 0} for row in read_metrics(x)] for x in (one, other)]
+    rows = [
+        [{**row, "steps_per_s": 0, "wall_s": 0} for row in read_metrics(x)] for x in (one, other)
+    ]
     assert repr(rows[0]) == repr(rows[1])
+    for name in ("last.agent", "best.agent"):
+        agents = [load_agent(x / name) for x in (one, other)]
+        assert agents[0].env_steps == agents[1].env_steps
+        assert agents[0].selection_rate == agents[1].selection_rate
+        for a, b in zip(*(jax.tree.leaves(agent.params) for agent in agents), strict=True):
+            np.testing.assert_array_equal(a, b)
 
 
 def command(*arguments: str) -> list[str]:
@@ -129,6 +138,20 @@ def test_the_default_checkpoint_is_small(tmp_path):
     save_tree(tmp_path / "state", trainer.init(jax.random.key(0)))
     size = sum(path.stat().st_size for path in tmp_path.rglob("*") if path.is_file())
     assert size <= 300e6
+
+
+def test_a_full_disk_is_said_and_leaves_nothing_that_counts(tmp_path):
+    folder = tmp_path / "run"
+    arguments = command(*OPTIONS, "--total-steps", "2000", "--out", str(folder))
+    # No file may grow beyond 20 kB: the write fails as on a full disk, with another number.
+    limit = "import resource, os, sys; resource.setrlimit(resource.RLIMIT_FSIZE, (20_000,) * 2); "
+    limited = [sys.executable, "-c", limit + "os.execv(sys.argv[1], sys.argv[1:])", *arguments]
+    done = subprocess.run(limited, capture_output=True, text=True)
+    assert done.returncode == 2
+    assert "could not be written" in done.stderr
+    assert done.stderr.count("\n") == 1
+    assert RunCheckpoints(folder).steps() == []
+    assert not list(folder.glob("*.agent*"))
 
 
 @pytest.mark.slow

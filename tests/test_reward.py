@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import itertools
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -82,7 +84,7 @@ WAY = [
 def test_progress_of_every_way_sums_to_success_and_the_first_potential():
     config = RewardConfig(kind="progress")
     for way in (WAY, WAY[::2], [WAY[0], WAY[4], WAY[1], WAY[5]]):
-        steps = zip(way, way[1:], strict=False)
+        steps = itertools.pairwise(way)
         paid = [total(config, before=before, **after) for before, after in steps]
         end = {"distance": 0.0, "grasped": True, "height": 0.3}
         paid.append(total(config, before=way[-1], success=True, **end))
@@ -93,7 +95,7 @@ def test_progress_of_every_way_sums_to_success_and_the_first_potential():
 
 def test_progress_pays_for_steps_ahead_and_charges_for_steps_back():
     config = RewardConfig(kind="progress")
-    for before, after in zip(WAY, WAY[1:], strict=False):
+    for before, after in itertools.pairwise(WAY):
         assert total(config, before=before, **after) > 0
         assert total(config, before=after, **before) < total(config, before=before, **before) < 0
 

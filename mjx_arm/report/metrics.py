@@ -50,6 +50,13 @@ def keep_metrics(folder: pathlib.Path, env_steps: int) -> None:
     shorter.replace(path)
 
 
+def last_wall_s(folder: pathlib.Path) -> float:
+    """Seconds that the run in this folder has trained for, 0 where there is none."""
+    path = folder / "metrics.jsonl"
+    rows = read_metrics(folder) if path.is_file() else []
+    return rows[-1]["wall_s"] if rows else 0.0
+
+
 def read_metrics(folder: pathlib.Path) -> list[dict[str, float]]:
     """Reads `metrics.jsonl` of a run folder; null becomes NaN.
 
