@@ -13,7 +13,6 @@ import argparse
 import json
 import os
 import pathlib
-import platform
 import time
 from collections.abc import Callable
 
@@ -21,6 +20,7 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
+from machine import machine
 from mujoco import batch as mj_batch
 
 from mjx_arm.physics import Physics, make_physics
@@ -81,21 +81,6 @@ def measure(functions: dict[str, Callable[[], None]], repeats: int) -> dict[str,
             function()
             seconds[name].append(time.perf_counter() - begin)
     return seconds
-
-
-def machine() -> dict[str, str | int | None]:
-    """What the figures depend on."""
-    cpu_info = pathlib.Path("/proc/cpuinfo")
-    lines = cpu_info.read_text().splitlines() if cpu_info.is_file() else []
-    names = [line.split(":")[1].strip() for line in lines if line.startswith("model name")]
-    return {
-        "cpu": names[0] if names else platform.processor(),
-        "cpus": os.cpu_count(),
-        "system": platform.platform(),
-        "python": platform.python_version(),
-        "jax": jax.__version__,
-        "mujoco": mujoco.__version__,
-    }
 
 
 def main() -> None:

@@ -9,9 +9,7 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import pathlib
-import platform
 import statistics
 import time
 from collections.abc import Callable
@@ -19,24 +17,9 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from machine import machine
 
 import mjx_arm
-
-
-def machine() -> dict[str, Any]:
-    """What the figures were taken on."""
-    name = platform.processor()
-    cpuinfo = pathlib.Path("/proc/cpuinfo")
-    if cpuinfo.is_file():
-        lines = cpuinfo.read_text().splitlines()
-        name = next((x.split(":")[1].strip() for x in lines if x.startswith("model name")), name)
-    return {
-        "cpu": name,
-        "cores": os.cpu_count(),
-        "device": jax.devices()[0].device_kind,
-        "jax": jax.__version__,
-        "xla_flags": os.environ.get("XLA_FLAGS", ""),
-    }
 
 
 def measure(run: Callable[[Any], Any], argument: Any, work: int, repeats: int) -> dict[str, float]:

@@ -193,6 +193,9 @@ class TrainConfig:
       epsilon_start: share of random actions at the beginning.
       epsilon_end: and after annealing.
       epsilon_steps: environment steps over which it falls linearly.
+      epsilon_spread: environments have different shares, in equal ratios from that divided by this
+        to that times this (Horgan et al. 2018): the one end finishes what it begins, the other
+        sees what comes after mistakes. 1 for all alike.
       widths: channels of the three convolutions.
       kernels: edges of their kernels, pixels.
       strides: their strides, pixels.
@@ -223,16 +226,17 @@ class TrainConfig:
     learning_starts: int = 5_000
     n_step: int = 3
     gamma: float = 0.99
-    learning_rate: float = 6e-4
+    learning_rate: float = 3e-4
     max_grad_norm: float = 10.0
     double: bool = True
     dueling: bool = True
     huber: bool = True
-    polyak: float = 0.005
+    polyak: float = 0.002
     target_period: int = 1_000
     epsilon_start: float = 1.0
     epsilon_end: float = 0.1
     epsilon_steps: int = 100_000
+    epsilon_spread: float = 4.0
     widths: tuple[int, int, int] = (16, 32, 32)
     kernels: tuple[int, int, int] = (4, 3, 3)
     strides: tuple[int, int, int] = (2, 1, 1)
@@ -258,6 +262,8 @@ class TrainConfig:
         for name in ("epsilon_start", "epsilon_end", "gamma", "polyak"):
             if not 0.0 <= getattr(self, name) <= 1.0:
                 raise ValueError(f"{name} is {getattr(self, name)}: give 0 to 1")
+        if self.epsilon_spread < 1.0:
+            raise ValueError(f"epsilon_spread is {self.epsilon_spread}: give at least 1")
         if self.replay_slots <= self.n_step:
             raise ValueError(
                 f"replay_size is {self.replay_size}: give more than n_step * num_envs = "
@@ -349,5 +355,6 @@ PRESETS = {
         huber=False,
         polyak=0.0,
         epsilon_steps=1_000_000,
+        epsilon_spread=1.0,
     ),
 }

@@ -157,7 +157,7 @@ def half_square(error: jax.Array) -> jax.Array:
 def epsilon_greedy(key: jax.Array, q: jax.Array, epsilon: jax.Array) -> jax.Array:
     """Actions for Q-values `[N, A] float32`, `[N] int32`; consumes the key.
 
-    Each is uniformly random with probability `epsilon [] float32`, else the best.
+    Each is uniformly random with probability `epsilon`, `[] or [N] float32`, else the best.
     """
     explore_key, action_key = jax.random.split(key)
     num_envs, num_actions = q.shape

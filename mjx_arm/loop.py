@@ -159,6 +159,12 @@ def epsilon_at(config: TrainConfig, env_steps: jax.Array) -> jax.Array:
     return config.epsilon_start + (config.epsilon_end - config.epsilon_start) * done
 
 
+def spread_epsilon(config: TrainConfig, epsilon: jax.Array) -> jax.Array:
+    """The share of each environment, `[N] float32`; see `TrainConfig.epsilon_spread`."""
+    ratios = np.geomspace(1 / config.epsilon_spread, config.epsilon_spread, config.num_envs)
+    return jnp.minimum(epsilon * jnp.asarray(ratios, jnp.float32), 1.0)
+
+
 @dataclasses.dataclass(frozen=True)
 class _Storage:
     """What the replay keeps of a frame, and how the observation comes back from it."""
@@ -230,7 +236,7 @@ class _Body:
         key, act_key, env_key, learn_key = jax.random.split(state.key, 4)
         epsilon = epsilon_at(self.config, state.vector_step * self.config.num_envs)
         q = self.dqn.apply(state.learner.params, state.obs)
-        action = epsilon_greedy(act_key, q, epsilon)
+        action = epsilon_greedy(act_key, q, spread_epsilon(self.config, epsilon))
         keys = jax.random.split(env_key, self.config.num_envs)
         envs, transition = jax.vmap(self.env.transition)(keys, state.envs, action)
         replay = add(state.replay, self._record(state, action, transition))

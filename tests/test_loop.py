@@ -9,7 +9,7 @@ import pytest
 
 import mjx_arm
 from mjx_arm.config import TrainConfig
-from mjx_arm.loop import epsilon_at, make_train, make_trainer, run_keys, summarise
+from mjx_arm.loop import epsilon_at, make_train, make_trainer, run_keys, spread_epsilon, summarise
 
 CONFIG = TrainConfig(
     physics="native",
@@ -118,6 +118,15 @@ def test_stored_states_are_drawn_as_they_were_seen():
 def test_epsilon_falls_linearly(steps, expected):
     assert epsilon_at(TrainConfig(), jnp.int32(steps)) == pytest.approx(expected)
     assert epsilon_at(TrainConfig(), jnp.int32(10 * 100_000)) == pytest.approx(0.1)
+
+
+def test_environments_explore_in_equal_ratios_around_epsilon():
+    config = TrainConfig(num_envs=5, epsilon_spread=4.0)
+    shares = spread_epsilon(config, jnp.float32(0.1))
+    np.testing.assert_allclose(shares, [0.025, 0.05, 0.1, 0.2, 0.4], rtol=1e-5)
+    assert spread_epsilon(config, jnp.float32(0.6)).max() == 1.0
+    alike = dataclasses.replace(config, epsilon_spread=1.0)
+    np.testing.assert_allclose(spread_epsilon(alike, jnp.float32(0.1)), 0.1, rtol=1e-6)
 
 
 def test_state_features_train_too():

@@ -1,0 +1,76 @@
+"""How often a trained agent succeeds, and whether it matters by which backend it is judged.
+
+For each run folder: how long it trained, 1,000 episodes of the best agent on the CPU's backend at
+epsilon 0.1 with a seed that neither training nor selection has seen, 100 episodes under MJX, and
+Newcombe's 95 % interval of the difference.
+
+    python benchmarks/success.py runs/NAME [runs/NAME ...] --json benchmarks/results/success_A.json
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import pathlib
+from typing import Any
+
+from machine import machine
+
+from mjx_arm.agent import find_agent, load_agent
+from mjx_arm.evaluate import Evaluation, evaluate, newcombe_interval
+from mjx_arm.report.metrics import read_metrics
+
+_EPSILON = 0.1
+_SEED = 7
+
+
+def try_agent(folder: pathlib.Path, physics: str, episodes: int) -> Evaluation:
+    """Evaluates the best agent of a run under a backend."""
+    agent = load_agent(folder, physics=physics)
+    options = {"episodes": episodes, "epsilon": _EPSILON, "seed": _SEED}
+    return evaluate(agent.env, agent.dqn.apply, agent.params, **options)
+
+
+def report(folder: pathlib.Path, episodes: int, mjx_episodes: int) -> dict[str, Any]:
+    """One run's row."""
+    agent, rows = load_agent(folder), read_metrics(folder)
+    wall_s = {row["env_steps"]: row["wall_s"] for row in rows}
+    native = try_agent(folder, "native", episodes)
+    mjx = try_agent(folder, "mjx", mjx_episodes)
+    return {
+        "env": agent.config.env,
+        "seed": agent.config.seed,
+        "agent": find_agent(folder).name,
+        "env_steps": agent.env_steps,
+        "minutes_to_this_agent": wall_s[agent.env_steps] / 60,
+        "minutes_of_training": rows[-1]["wall_s"] / 60,
+        "native": dataclasses.asdict(native),
+        "mjx": dataclasses.asdict(mjx),
+        "native_minus_mjx": native.rate - mjx.rate,
+        "newcombe_ci95": newcombe_interval(
+            native.successes, native.episodes, mjx.successes, mjx.episodes
+        ),
+        "config": dataclasses.asdict(agent.config),
+    }
+
+
+def main() -> None:
+    """Evaluates, prints a line a run and, where asked to, writes the figures to a file."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("runs", nargs="+", type=pathlib.Path, help="run folders")
+    parser.add_argument("--episodes", type=int, default=1000)
+    parser.add_argument("--mjx-episodes", type=int, default=100)
+    parser.add_argument("--json", type=pathlib.Path, help="file to write the results to")
+    arguments = parser.parse_args()
+    rows = []
+    for folder in arguments.runs:
+        rows.append(report(folder, arguments.episodes, arguments.mjx_episodes))
+        print(json.dumps({k: v for k, v in rows[-1].items() if k != "config"}))
+        if arguments.json:
+            text = json.dumps({"machine": machine(), "rows": rows}, indent=1)
+            arguments.json.write_text(text + "\n")
+
+
+if __name__ == "__main__":
+    main()
