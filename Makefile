@@ -20,13 +20,15 @@ STAMP := $(VENV)/.locked-$(LOCK)
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 SUPPORTED := import sys; sys.exit(sys.version_info[:2] not in {(3, 11), (3, 12)})
 
-.PHONY: help setup train test test-slow format lock clean
+.PHONY: help setup train test test-slow peers test-peers format lock lock-peers clean
 
 help:
 	@echo "make setup      build $(VENV) from the lock; GPU=cuda12 or GPU=cuda13 for NVIDIA"
 	@echo "make train      train; ARGS=\"...\" goes to train.py"
 	@echo "make test       ruff, mypy and the default tests"
 	@echo "make test-slow  the tests marked slow"
+	@echo "make peers      build $(PEERS) with what we are measured against"
+	@echo "make test-peers the tests of the adapters, with trainers of others"
 	@echo "make format     let ruff rewrite the sources"
 	@echo "make lock       resolve the lock again; ARGS=--upgrade for the newest versions"
 	@echo "make clean      remove caches and built packages (not $(VENV), not runs/)"
@@ -59,6 +61,24 @@ test: $(STAMP)
 test-slow: $(STAMP)
 	$(BIN)/python -m pytest -m slow
 
+# What we are measured against has an environment of its own, on Linux with Python 3.11. Its torch
+# is the CPU build, which PyTorch has in a place of its own: name that in PIP_FIND_LINKS.
+PEERS := .venv-peers
+
+peers: $(PEERS)/.locked
+	@echo "$(PEERS) is ready: $(PEERS)/bin/python benchmarks/peers.py"
+
+$(PEERS)/.locked: requirements/peers.txt
+	@$(PYTHON) -m venv --clear $(PEERS)
+	@$(PEERS)/bin/python -m pip install --quiet --disable-pip-version-check \
+	  --require-hashes --only-binary :all: -r $<
+	@$(PEERS)/bin/python -m pip install --quiet --disable-pip-version-check \
+	  --no-build-isolation --no-deps --editable .
+	@touch $@
+
+test-peers: $(PEERS)/.locked
+	$(PEERS)/bin/python -m pytest -m peers
+
 format: $(STAMP)
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
@@ -67,6 +87,14 @@ lock: .venv-lock/bin/uv-$(UV_VERSION)
 	@$(call compile,cpu)
 	@$(call compile,cuda12,--extra cuda12)
 	@$(call compile,cuda13,--extra cuda13)
+
+lock-peers: .venv-lock/bin/uv-$(UV_VERSION)
+	@echo "torch==2.13.0+cpu" > .venv-lock/constraints.txt
+	@UV_CUSTOM_COMPILE_COMMAND="make lock-peers" .venv-lock/bin/uv pip compile pyproject.toml \
+	  --no-config --quiet --python-platform x86_64-manylinux_2_28 --python-version 3.11 \
+	  --generate-hashes --no-emit-index-url --no-emit-find-links --find-links "$(PIP_FIND_LINKS)" \
+	  --constraints .venv-lock/constraints.txt --extra peers $(ARGS) --output-file requirements/peers.txt
+	@sed -i 's/^torch==\([0-9.]*\)+cpu/torch==\1/' requirements/peers.txt
 
 # One file serves Python 3.11 and 3.12, Linux and macOS: markers choose among the versions.
 compile = UV_CUSTOM_COMPILE_COMMAND="make lock" .venv-lock/bin/uv pip compile pyproject.toml \

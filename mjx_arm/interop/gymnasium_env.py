@@ -1,0 +1,248 @@
+"""The environments as gymnasium's `Env` and `VectorEnv`; numpy outside, one jitted call a step."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium
+import jax
+import jax.numpy as jnp
+import numpy as np
+from gymnasium.vector import AutoresetMode
+
+from mjx_arm.auto_reset import AutoReset
+from mjx_arm.env import Env, EnvState, make
+from mjx_arm.physics import compiler_options
+from mjx_arm.render import make_renderer, rgb
+
+# Edge of the pictures of `render`, pixels, and of how many a second.
+_PICTURE = 256
+_FPS = 30
+_MODES = {"next_step": AutoresetMode.NEXT_STEP, "same_step": AutoresetMode.SAME_STEP}
+
+
+def observation_space(env: Env) -> gymnasium.Space[Any]:
+    """Space of a single environment's observations."""
+    kind, size = env.config.observation, env.config.size
+    image = gymnasium.spaces.Box(0, 255, (*size, 3), np.uint8)
+    if kind == "rgb":
+        return image
+    if kind == "rgbd":
+        depth = gymnasium.spaces.Box(0.0, np.inf, size, np.float32)
+        return gymnasium.spaces.Dict({"rgb": image, "depth": depth})
+    if kind == "segmentation":
+        return gymnasium.spaces.Box(-1, env.scene.mj_model.ngeom - 1, size, np.int32)
+    if kind == "packed":
+        return gymnasium.spaces.Box(0, 2**32 - 1, size, np.uint32)
+    obs = jax.eval_shape(env.reset, jax.random.key(0))[0]
+    assert isinstance(obs, jax.ShapeDtypeStruct)
+    return gymnasium.spaces.Box(-np.inf, np.inf, obs.shape, np.float32)
+
+
+def _jit(env: Env, function: Any) -> Any:
+    return jax.jit(function, compiler_options=compiler_options(env.physics))
+
+
+def _numpy(tree: Any) -> Any:
+    # Copies: what gymnasium hands out may be written to and kept.
+    return jax.tree.map(np.array, tree)
+
+
+class ArmCubeEnv(gymnasium.Env[Any, np.int64]):
+    """One environment, for anything that speaks gymnasium.
+
+    `reset` with a seed starts anew; without one it starts the next episode, with what outlives the
+    last one (where the cube lies in environment B). Episodes end by themselves, truncated after
+    `max_steps`: no `TimeLimit` is needed. `info` has what `mjx_arm.env.Transition` says.
+
+    Args:
+      name: environment, `"A"` or `"B"`.
+      render_mode: None or `"rgb_array"`, a picture of 256 by 256 pixels with shadows.
+      **options: fields of `EnvConfig`, such as `observation` or `physics`.
+
+    Raises:
+      ValueError: unknown environment or option, or a value out of its domain.
+    """
+
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": _FPS}  # noqa: RUF012
+
+    def __init__(self, name: str = "A", render_mode: str | None = None, **options: Any):
+        _check_render_mode(render_mode)
+        self.render_mode = render_mode
+        self.env = make(name, **options)
+        self.observation_space = observation_space(self.env)
+        self.action_space = gymnasium.spaces.Discrete(self.env.num_actions)
+        self._reset = _jit(self.env, self.env.reset)
+        self._step = _jit(self.env, functools.partial(self.env.step, jax.random.key(0)))
+        self._restart = _jit(self.env, self._next_episode)
+        self._state: EnvState | None = None
+
+    def _next_episode(self, key: jax.Array, state: EnvState) -> Any:
+        state = self.env.restart(key, state)
+        return self.env.observe(state), state
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Starts an episode; `options` are not used."""
+        super().reset(seed=seed)
+        key = _draw_key(self.np_random)
+        if seed is not None or self._state is None:
+            obs, self._state = self._reset(key)
+        else:
+            obs, self._state = self._restart(key, self._state)
+        return _numpy(obs), {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """Advances by one iteration.
+
+        Raises:
+          ValueError: the action is none, or `reset` was never called.
+        """
+        if self._state is None:
+            raise ValueError("step before reset: call reset first")
+        if not self.action_space.contains(np.int64(action)):
+            raise ValueError(f"action is {action}: give an integer from 0 to 13")
+        obs, self._state, reward, terminated, truncated, info = self._step(
+            self._state, jnp.int32(action)
+        )
+        flags = bool(terminated), bool(truncated)
+        return _numpy(obs), float(reward), *flags, {k: v.item() for k, v in _numpy(info).items()}
+
+    def render(self) -> Any:
+        """A picture `[256, 256, 3] uint8` of the scene, or None without a render mode."""
+        if self.render_mode is None or self._state is None:
+            return None
+        return np.array(self._draw(self._state))
+
+    @functools.cached_property
+    def _draw(self) -> Any:
+        return jax.jit(_make_picture(self.env))
+
+
+class ArmCubeVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
+    """Many environments in one jitted call; what `gymnasium.make_vec` makes of our ids.
+
+    With `autoreset="next_step"` (gymnasium's default) the step after the end of an episode ignores
+    its action and returns the next one's first observation; with `"same_step"` the step that ends
+    it does, and the true last observation is in `info["final_obs"]`.
+
+    Args:
+      name: environment, `"A"` or `"B"`.
+      num_envs: how many.
+      autoreset: `"next_step"` or `"same_step"`.
+      render_mode: None or `"rgb_array"`, pictures of all environments.
+      **options: fields of `EnvConfig`.
+
+    Raises:
+      ValueError: unknown environment or option, or a value out of its domain.
+    """
+
+    def __init__(
+        self,
+        name: str = "A",
+        num_envs: int = 1,
+        autoreset: str = "next_step",
+        render_mode: str | None = None,
+        **options: Any,
+    ):
+        if num_envs < 1:
+            raise ValueError(f"num_envs is {num_envs}: give at least 1")
+        _check_render_mode(render_mode)
+        self.render_mode = render_mode
+        self.num_envs = num_envs
+        self.env = make(name, **options)
+        self._auto = AutoReset(self.env, autoreset)
+        self.metadata = {**ArmCubeEnv.metadata, "autoreset_mode": _MODES[autoreset]}
+        self.single_observation_space = observation_space(self.env)
+        self.single_action_space = gymnasium.spaces.Discrete(self.env.num_actions)
+        batch = gymnasium.vector.utils.batch_space
+        self.observation_space = batch(self.single_observation_space, num_envs)
+        self.action_space = batch(self.single_action_space, num_envs)
+        self._reset = _jit(self.env, jax.vmap(self._auto.reset))
+        self._step = _jit(self.env, jax.vmap(self._auto.step))
+        self._state: Any = None
+
+    def _keys(self) -> jax.Array:
+        return jax.random.split(_draw_key(self.np_random), self.num_envs)
+
+    def reset(
+        self, *, seed: int | list[int] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Starts an episode in every environment.
+
+        Raises:
+          ValueError: `seed` is a list; the environments share one.
+        """
+        if isinstance(seed, list):
+            raise ValueError("seed is a list: give one integer, which all environments draw from")
+        super().reset(seed=seed)
+        obs, self._state = self._reset(self._keys())
+        return _numpy(obs), {}
+
+    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        """Advances every environment by one iteration, or resets it.
+
+        Raises:
+          ValueError: an action is none, or `reset` was never called.
+        """
+        if self._state is None:
+            raise ValueError("step before reset: call reset first")
+        actions = np.asarray(actions)
+        if actions.shape != (self.num_envs,) or not ((actions >= 0) & (actions < 14)).all():
+            raise ValueError(f"actions are {actions}: give {self.num_envs} integers from 0 to 13")
+        obs, self._state, *rest, info = self._step(
+            self._keys(), self._state, jnp.asarray(actions, jnp.int32)
+        )
+        reward, terminated, truncated = _numpy(rest)
+        return _numpy(obs), reward, terminated, truncated, self._info(_numpy(info))
+
+    def _info(self, info: dict[str, Any]) -> dict[str, Any]:
+        """With gymnasium's masks: `_name` says for which environments `name` holds."""
+        reset = info.pop("reset")
+        if self._auto.mode == "next_step":
+            masked = dict.fromkeys(info, ~reset)
+        else:
+            final = info.pop("final_observation")
+            masked = dict.fromkeys(info, np.ones(self.num_envs, np.bool_))
+            if reset.any():
+                rows = [jax.tree.map(lambda x, i=i: x[i], final) for i in range(self.num_envs)]
+                objects = np.empty(self.num_envs, object)
+                for i in np.flatnonzero(reset):
+                    objects[i] = rows[i]
+                info |= {"final_obs": objects}
+                masked |= {"final_obs": reset}
+        return info | {f"_{name}": mask for name, mask in masked.items()}
+
+    def render(self) -> tuple[Any, ...] | None:
+        """Pictures `[256, 256, 3] uint8` of all environments, or None without a render mode."""
+        if self.render_mode is None or self._state is None:
+            return None
+        return tuple(np.array(self._draw(self._state.env)))
+
+    @functools.cached_property
+    def _draw(self) -> Any:
+        return jax.jit(jax.vmap(_make_picture(self.env)))
+
+
+def _make_picture(env: Env) -> Callable[[EnvState], jax.Array]:
+    """Makes `state -> [256, 256, 3] uint8`."""
+    size = _PICTURE, _PICTURE
+    draw = make_renderer(env.scene, camera=env.config.camera, size=size, shadows=True)
+
+    def picture(state: EnvState) -> jax.Array:
+        poses = state.physics.poses
+        return rgb(draw(poses.geom_xpos, poses.geom_xmat))
+
+    return picture
+
+
+def _draw_key(generator: np.random.Generator) -> jax.Array:
+    return jax.random.key(generator.integers(2**32, dtype=np.uint32))
+
+
+def _check_render_mode(mode: str | None) -> None:
+    if mode not in (None, "rgb_array"):
+        raise ValueError(f"unknown render_mode {mode!r}: give None or 'rgb_array'")

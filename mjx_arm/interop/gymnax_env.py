@@ -1,0 +1,112 @@
+"""The environments as gymnax environments: of its version 1 (six values), and classic (five)."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import gymnasium
+import jax
+import jax.numpy as jnp
+
+from mjx_arm.env import EnvState, make
+from mjx_arm.interop.gymnasium_env import observation_space
+
+try:
+    from gymnax.environments import spaces
+    from gymnax.environments.environment import Environment, EnvParams
+except ImportError as error:
+    raise ImportError("gymnax is not installed: pip install 'mjx_arm[gymnax]'") from error
+
+
+class GymnaxEnv(Environment):  # type: ignore[misc]  # gymnax ships no types
+    """An environment of gymnax 1.0: `step` gives six values and resets in the same step.
+
+    `info["final_observation"]` has the true last observation of an episode, at every step. In
+    environment B a start is handed what outlives an episode; see `mjx_arm.Env.restart`.
+
+    Args:
+      name: environment, `"A"` or `"B"`.
+      **options: fields of `EnvConfig`, but for `rgbd`: gymnax has no space for it.
+
+    Raises:
+      ValueError: unknown environment or option, or a value out of its domain.
+    """
+
+    def __init__(self, name: str = "A", **options: Any):
+        self.env = make(name, **options)
+        self._space = observation_space(self.env)
+        if not isinstance(self._space, gymnasium.spaces.Box):
+            raise ValueError("observation 'rgbd' has no gymnax space: give another observation")
+
+    @property
+    def default_params(self) -> EnvParams:
+        """Parameters that episodes of `EnvConfig.max_steps` have."""
+        return EnvParams(max_steps_in_episode=self.env.config.max_steps)
+
+    @partial(jax.jit, static_argnames=("self",))
+    def step(
+        self, key: jax.Array, state: EnvState, action: Any, params: EnvParams | None = None
+    ) -> tuple[Any, EnvState, jax.Array, jax.Array, jax.Array, dict[str, Any]]:
+        """Advances by one iteration, and resets where that ended the episode.
+
+        Returns:
+          observation, state, reward, terminated, truncated and info.
+        """
+        params = self.default_params if params is None else params
+        state, transition = self.env.transition(state, jnp.asarray(action, jnp.int32))
+        too_long = (state.step >= params.max_steps_in_episode) & ~transition.terminated
+        truncated = transition.truncated | too_long
+        ended = transition.terminated | truncated
+        final = self.env.observe(state)
+        fresh = self.env.restart(key, state, needed=ended)
+        first = self.env.observe(fresh)
+        obs, state = jax.tree.map(
+            lambda a, b: jnp.where(ended, a, b), (first, fresh), (final, state)
+        )
+        info = transition.info | {
+            "terminated": transition.terminated,
+            "truncated": truncated,
+            "final_observation": final,
+        }
+        return obs, state, transition.reward, transition.terminated, truncated, info
+
+    def reset_env(self, key: jax.Array, params: EnvParams) -> tuple[Any, EnvState]:
+        """Starts an episode that owes nothing to an earlier one."""
+        del params
+        return self.env.reset(key)
+
+    @property
+    def name(self) -> str:
+        """Name of the environment."""
+        return f"mjx_arm-{self.env.config.scene}"
+
+    @property
+    def num_actions(self) -> int:
+        """Number of discrete actions."""
+        return self.env.num_actions
+
+    def action_space(self, params: EnvParams | None = None) -> spaces.Discrete:
+        """Space of the actions."""
+        del params
+        return spaces.Discrete(self.num_actions)
+
+    def observation_space(self, params: EnvParams | None = None) -> spaces.Box:
+        """Space of the observations."""
+        del params
+        space = self._space
+        return spaces.Box(space.low.min(), space.high.max(), space.shape, space.dtype)
+
+
+class ClassicGymnaxEnv(GymnaxEnv):
+    """The same for trainers written for gymnax before 1.0: `step` gives five values, with `done`.
+
+    `info` still has `terminated` and `truncated`.
+    """
+
+    def step(  # type: ignore[override]
+        self, key: jax.Array, state: EnvState, action: Any, params: EnvParams | None = None
+    ) -> tuple[Any, EnvState, jax.Array, jax.Array, dict[str, Any]]:
+        """Advances by one iteration: observation, state, reward, done and info."""
+        obs, state, reward, terminated, truncated, info = super().step(key, state, action, params)
+        return obs, state, reward, terminated | truncated, info

@@ -1,0 +1,134 @@
+from __future__ import annotations
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import AutoresetMode
+
+import mjx_arm.interop
+
+OPTIONS = {"physics": "native", "size": (16, 16), "max_steps": 4}
+SHOULDER_UP = 2
+A, B = "mjx_arm/ArmCubeA-v0", "mjx_arm/ArmCubeB-v0"
+
+
+# Depth has no bound where nothing is hit, and a cube may fall for ever.
+@pytest.mark.filterwarnings("ignore:.*A Box observation space m.*imum value is:UserWarning")
+@pytest.mark.parametrize("observation", ["rgb", "rgbd", "segmentation", "packed", "state"])
+def test_gymnasiums_checker_has_no_complaint(observation):
+    env = gymnasium.make(A, observation=observation, render_mode="rgb_array", **OPTIONS)
+    check_env(env.unwrapped)
+    env.close()
+
+
+def test_episodes_end_by_themselves():
+    env = gymnasium.make(A, **OPTIONS)
+    env.reset(seed=0)
+    ends = [env.step(0)[2:4] for _ in range(4)]
+    assert ends == [(False, False)] * 3 + [(False, True)]
+
+
+def test_a_picture_is_bigger_than_what_the_agent_sees():
+    env = gymnasium.make(A, render_mode="rgb_array", **OPTIONS)
+    env.reset(seed=0)
+    picture = env.render()
+    assert (picture.shape, picture.dtype) == ((256, 256, 3), np.uint8)
+    assert picture.std() > 5
+
+
+def test_the_cube_outlives_a_failed_episode_but_not_a_seed():
+    env = gymnasium.make(B, observation="state", **OPTIONS)
+    places = [env.reset(seed=seed)[0][11:13] for seed in (1, None, 1, 2)]
+    np.testing.assert_array_equal(places[0], places[1])
+    np.testing.assert_array_equal(places[0], places[2])
+    assert (places[0] != places[3]).all()
+
+
+@pytest.mark.parametrize(("action", "message"), [(14, "action is 14"), (-1, "action is -1")])
+def test_actions_that_are_none_are_refused(action, message):
+    env = mjx_arm.interop.ArmCubeEnv(**OPTIONS)
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match=message):
+        env.step(action)
+
+
+def test_step_before_reset_is_refused():
+    for env in (mjx_arm.interop.ArmCubeEnv(**OPTIONS), vector_env()):
+        with pytest.raises(ValueError, match="call reset first"):
+            env.step(np.zeros(3, int))
+    with pytest.raises(ValueError, match="unknown render_mode 'human'"):
+        mjx_arm.interop.ArmCubeEnv(render_mode="human")
+
+
+def vector_env(autoreset="next_step", **options):
+    return gymnasium.make_vec(
+        A,
+        num_envs=3,
+        vectorization_mode="vector_entry_point",
+        autoreset=autoreset,
+        observation="state",
+        **OPTIONS | options,
+    )
+
+
+@pytest.mark.parametrize("autoreset", ["next_step", "same_step"])
+def test_a_vector_env_resets_as_gymnasium_says(autoreset):
+    env = vector_env(autoreset)
+    assert env.metadata["autoreset_mode"] is AutoresetMode[autoreset.upper()]
+    first, _ = env.reset(seed=0)
+    assert env.observation_space.contains(first)
+    steps = [env.step(np.full(3, SHOULDER_UP)) for _ in range(5)]
+    assert all(env.observation_space.contains(obs) for obs, *_ in steps)
+    ended = [step[3].tolist() for step in steps]
+    obs, reward, *_, info = steps[3 if autoreset == "same_step" else 4]
+    np.testing.assert_allclose(obs, first, atol=1e-6)
+    assert ended[:3] == [[False] * 3] * 3
+    assert ended[3] == [True] * 3
+    if autoreset == "same_step":
+        assert info["_final_obs"].all()
+        # The arm has moved in the last observation, and is as at the start in the new one.
+        last = np.stack(info["final_obs"])
+        assert (np.abs(last - first).max(axis=-1) > 1e-3).all()
+        assert (reward != 0).all()
+    else:
+        assert ended[4] == [False] * 3
+        assert (reward == 0).all()
+        assert not info["_grasped"].any()
+
+
+def test_a_vector_env_does_what_single_ones_do():
+    vector, single = vector_env(), gymnasium.make(A, observation="state", **OPTIONS)
+    vector.reset(seed=0)
+    single.reset(seed=0)
+    for action in (2, 5, 13):
+        obs, reward, *_ = vector.step(np.full(3, action))
+        one, one_reward, *_ = single.step(action)
+        np.testing.assert_allclose(obs, np.tile(one, (3, 1)), atol=1e-6)
+        np.testing.assert_allclose(reward, one_reward, atol=1e-6)
+
+
+def test_bad_vector_options_are_refused():
+    with pytest.raises(ValueError, match="num_envs is 0"):
+        mjx_arm.interop.ArmCubeVectorEnv(num_envs=0)
+    with pytest.raises(ValueError, match="unknown auto-reset mode"):
+        mjx_arm.interop.ArmCubeVectorEnv(autoreset="never")
+    env = vector_env()
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match="give 3 integers"):
+        env.step(np.zeros(2, int))
+
+
+@pytest.mark.peers
+def test_stable_baselines3_takes_it_as_it_is():
+    from stable_baselines3 import DQN
+    from stable_baselines3.common.env_checker import check_env as check
+    from stable_baselines3.common.env_util import make_vec_env
+
+    options = OPTIONS | {"size": (36, 36)}
+    check(mjx_arm.interop.ArmCubeEnv(**options))
+    envs = make_vec_env(A, n_envs=2, env_kwargs=options)
+    agent = DQN("CnnPolicy", envs, learning_starts=20, buffer_size=100, batch_size=4)
+    agent.learn(60)
+    assert agent.num_timesteps >= 60
+    assert agent._n_updates > 0

@@ -1,0 +1,87 @@
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+pytestmark = pytest.mark.peers
+
+OPTIONS = {"physics": "native", "observation": "state"}
+
+
+@pytest.fixture(scope="module")
+def gymnax_env():
+    from mjx_arm.interop import gymnax_env
+
+    return gymnax_env
+
+
+def test_six_values_and_the_true_last_observation(gymnax_env):
+    env = gymnax_env.GymnaxEnv("A", max_steps=3, **OPTIONS)
+    params = env.default_params
+    first, state = env.reset(jax.random.key(0), params)
+    for step in range(3):
+        obs, state, reward, terminated, truncated, info = env.step(
+            jax.random.key(step), state, 2, params
+        )
+    assert reward.dtype == jnp.float32
+    assert (bool(terminated), bool(truncated)) == (False, True)
+    np.testing.assert_allclose(obs, first, atol=1e-6)
+    assert np.abs(info["final_observation"] - first).max() > 1e-3
+    assert int(state.step) == 0
+
+
+def test_the_length_of_episodes_is_a_parameter(gymnax_env):
+    env = gymnax_env.GymnaxEnv("A", **OPTIONS)
+    params = env.default_params.replace(max_steps_in_episode=2)
+    _, state = env.reset(jax.random.key(0), params)
+    flags = []
+    for step in range(4):
+        _, state, *_, truncated, _ = env.step(jax.random.key(step), state, 2, params)
+        flags.append(bool(truncated))
+    assert flags == [False, True, False, True]
+
+
+def test_spaces_are_gymnaxs(gymnax_env):
+    from gymnax.environments import environment, spaces
+
+    env = gymnax_env.GymnaxEnv("B", **OPTIONS)
+    assert isinstance(env, environment.Environment)
+    assert isinstance(env.action_space(env.default_params), spaces.Discrete)
+    obs, _ = env.reset(jax.random.key(0))
+    space = env.observation_space(env.default_params)
+    assert space.shape == obs.shape
+    assert space.dtype == obs.dtype
+    with pytest.raises(ValueError, match="rgbd"):
+        gymnax_env.GymnaxEnv("A", observation="rgbd", physics="native")
+
+
+# Its own imports are behind the times.
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+def test_rejax_learns_to_lift_a_held_cube(gymnax_env):
+    """Rejax as it comes from the index; its DQN knows nothing of us."""
+    import rejax
+
+    env = gymnax_env.ClassicGymnaxEnv(
+        "A", start="in_grasp", lift=0.2, max_steps=60, reward="completion", **OPTIONS
+    )
+    agent = rejax.get_algo("dqn").create(
+        env=env,
+        total_timesteps=60_000,
+        eval_freq=30_000,
+        num_envs=20,
+        buffer_size=20_000,
+        fill_buffer=2_000,
+        batch_size=128,
+        learning_rate=5e-4,
+        target_update_freq=200,
+        gamma=0.95,
+    )
+    # Our tests promote types strictly; others' code does not.
+    with jax.numpy_dtype_promotion("standard"):
+        _, (lengths, returns) = jax.jit(agent.train)(jax.random.key(0))
+    print("mean returns", returns.mean(axis=-1), "lengths", lengths.mean(axis=-1))
+    # Success pays 100, all else together less than 1 a step.
+    assert returns[0].mean() < 50
+    assert returns[-1].mean() > 80
