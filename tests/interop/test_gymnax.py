@@ -5,6 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from mjx_arm.config import RewardConfig
+
 pytestmark = pytest.mark.peers
 
 OPTIONS = {"physics": "native", "observation": "state"}
@@ -63,25 +65,25 @@ def test_rejax_learns_to_lift_a_held_cube(gymnax_env):
     """Rejax as it comes from the index; its DQN knows nothing of us."""
     import rejax
 
+    reward = RewardConfig(kind="progress", scale=0.1)
     env = gymnax_env.ClassicGymnaxEnv(
-        "A", start="in_grasp", lift=0.2, max_steps=60, reward="completion", **OPTIONS
+        "A", start="in_grasp", lift=0.2, max_steps=60, reward=reward, **OPTIONS
     )
     agent = rejax.get_algo("dqn").create(
         env=env,
         total_timesteps=60_000,
         eval_freq=30_000,
-        num_envs=20,
+        num_envs=10,
         buffer_size=20_000,
         fill_buffer=2_000,
-        batch_size=128,
+        batch_size=64,
         learning_rate=5e-4,
         target_update_freq=200,
-        gamma=0.95,
+        gamma=reward.discount,
     )
     # Our tests promote types strictly; others' code does not.
     with jax.numpy_dtype_promotion("standard"):
-        _, (lengths, returns) = jax.jit(agent.train)(jax.random.key(0))
-    print("mean returns", returns.mean(axis=-1), "lengths", lengths.mean(axis=-1))
-    # Success pays 100, all else together less than 1 a step.
-    assert returns[0].mean() < 50
-    assert returns[-1].mean() > 80
+        _, (lengths, _) = jax.jit(agent.train)(jax.random.key(1))
+    # Ten steps lift it, 60 end an episode without success.
+    assert lengths[0].mean() > 50
+    assert lengths[-1].mean() < 20
