@@ -199,6 +199,7 @@ class TrainConfig:
       widths: channels of the three convolutions.
       kernels: edges of their kernels, pixels.
       strides: their strides, pixels.
+      pool: edge of the max-pooling between them, pixels; 1 for none.
       hidden: units of the first dense layer.
       chunk_steps: environment steps in one compiled call, between two looks at it from outside.
       select_every: environment steps between two evaluations that select the best agent, on starts
@@ -240,6 +241,7 @@ class TrainConfig:
     widths: tuple[int, int, int] = (16, 32, 32)
     kernels: tuple[int, int, int] = (4, 3, 3)
     strides: tuple[int, int, int] = (2, 1, 1)
+    pool: int = 2
     hidden: int = 256
     chunk_steps: int = 16_384
     select_every: int = 262_144
@@ -321,6 +323,7 @@ _COUNTS = (
     "target_period",
     "epsilon_steps",
     "hidden",
+    "pool",
     "chunk_steps",
     "max_steps",
     "select_episodes",

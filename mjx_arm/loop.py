@@ -79,7 +79,7 @@ def make_trainer(config: TrainConfig) -> Trainer:
     Raises:
       ValueError: the environment cannot be made.
     """
-    body = _make_body(config)
+    body = make_body(config)
     init, run_chunk = body.init, body.run_chunk
     if config.num_seeds > 1:
         init, run_chunk = jax.vmap(init), jax.vmap(run_chunk)
@@ -110,7 +110,7 @@ def make_train(config: TrainConfig) -> Callable[[jax.Array], tuple[LoopState, Co
     Raises:
       ValueError: the environment cannot be made.
     """
-    body = _make_body(config)
+    body = make_body(config)
 
     def train(key: jax.Array) -> tuple[LoopState, Counts]:
         return jax.lax.scan(
@@ -137,6 +137,7 @@ def make_dqn(config: TrainConfig, env: Env) -> DQN:
             widths=config.widths,
             kernels=config.kernels,
             strides=config.strides,
+            pool=config.pool,
             hidden=config.hidden,
             dueling=config.dueling,
         )
@@ -184,14 +185,22 @@ def _make_storage(config: TrainConfig, env: Env) -> _Storage:
     return _Storage(store=lambda envs, obs: envs.env.physics.qpos, restore=jax.vmap(draw))
 
 
-def _make_body(config: TrainConfig) -> _Body:
+def make_body(config: TrainConfig) -> Body:
+    """Makes what one seed's training run is made of."""
     env = make_env(config.env_config())
-    return _Body(config, AutoReset(env), make_dqn(config, env), _make_storage(config, env))
+    return Body(config, AutoReset(env), make_dqn(config, env), _make_storage(config, env))
 
 
 @dataclasses.dataclass(frozen=True)
-class _Body:
-    """The body of the scan, for one seed."""
+class Body:
+    """The body of the scan, for one seed.
+
+    Attributes:
+      config: the options.
+      env: the environment, which resets itself.
+      dqn: the algorithm.
+      storage: what the replay keeps of a frame.
+    """
 
     config: TrainConfig
     env: AutoReset
@@ -199,6 +208,7 @@ class _Body:
     storage: _Storage
 
     def init(self, key: jax.Array) -> LoopState:
+        """The state before the first step. Consumes the key."""
         config = self.config
         reset_key, learner_key, key = jax.random.split(key, 3)
         obs, envs = jax.vmap(self.env.reset)(jax.random.split(reset_key, config.num_envs))
@@ -228,11 +238,13 @@ class _Body:
         return dataclasses.replace(state, counts=zeros)
 
     def run_chunk(self, state: LoopState) -> tuple[LoopState, Counts]:
+        """Runs `TrainConfig.chunk_length` steps; the counts are theirs."""
         state = dataclasses.replace(state, counts=jax.tree.map(jnp.zeros_like, state.counts))
         state, _ = jax.lax.scan(self.step, state, None, length=self.config.chunk_length)
         return state, state.counts
 
     def step(self, state: LoopState, _: None) -> tuple[LoopState, None]:
+        """Collects, stores, learns and counts one step of all environments."""
         key, act_key, env_key, learn_key = jax.random.split(state.key, 4)
         epsilon = epsilon_at(self.config, state.vector_step * self.config.num_envs)
         q = self.dqn.apply(state.learner.params, state.obs)
@@ -240,7 +252,7 @@ class _Body:
         keys = jax.random.split(env_key, self.config.num_envs)
         envs, transition = jax.vmap(self.env.transition)(keys, state.envs, action)
         replay = add(state.replay, self._record(state, action, transition))
-        learner, learned = self._learn(learn_key, state.learner, replay)
+        learner, learned = self.learn(learn_key, state.learner, replay)
         episode, counts = self._count(state, q, transition)
         counts |= learned
         state = LoopState(
@@ -265,9 +277,10 @@ class _Body:
             void=transition.info["reset"] | transition.info["diverged"],
         )
 
-    def _learn(
+    def learn(
         self, key: jax.Array, learner: Learner, replay: Replay
     ) -> tuple[Learner, dict[str, jax.Array]]:
+        """The updates of one step, none while the replay holds too little."""
         config = self.config
 
         def one(learner: Learner, key: jax.Array) -> tuple[Learner, dict[str, jax.Array]]:

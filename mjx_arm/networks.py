@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from mjx_arm.render import rgb
 
 
-def max_pool(x: jax.Array, size: int = 2) -> jax.Array:
+def max_pool(x: jax.Array, size: int) -> jax.Array:
     """Max-pooling without overlap: `[..., H, W, C]` to `[..., H // size, W // size, C]`.
 
     A reshape and a maximum: on CPU the gradient of a windowed reduction is many times slower.
@@ -112,6 +112,7 @@ class PixelQNetwork(nn.Module):
       widths: channels of the three convolutions.
       kernels: their kernels' edges.
       strides: their strides.
+      pool: edge of the max-pooling between them, 1 for none.
       hidden: units of the first dense layer.
       dueling: split the last layer into value and advantage (Wang et al. 2016).
     """
@@ -120,6 +121,7 @@ class PixelQNetwork(nn.Module):
     widths: Sequence[int]
     kernels: Sequence[int]
     strides: Sequence[int]
+    pool: int
     hidden: int
     dueling: bool
 
@@ -132,7 +134,7 @@ class PixelQNetwork(nn.Module):
         ):
             x = nn.relu(PatchConv(width, kernel, stride)(x))
             if layer < len(self.widths) - 1:
-                x = max_pool(x)
+                x = max_pool(x, self.pool)
         x = x.reshape(x.shape[0], -1)
         return Head(self.hidden, self.num_actions, self.dueling)(x)
 

@@ -28,12 +28,12 @@ def test_patch_convolution_equals_flax(kernel, stride, size):
 
 def test_max_pool_equals_flax():
     x = jax.random.normal(jax.random.key(0), (2, 9, 8, 3))
-    np.testing.assert_array_equal(max_pool(x), nn.max_pool(x, (2, 2), (2, 2)))
+    np.testing.assert_array_equal(max_pool(x, 2), nn.max_pool(x, (2, 2), (2, 2)))
 
 
 @pytest.mark.parametrize("dueling", [False, True])
 def test_networks_give_a_value_an_action(dueling):
-    pixel = PixelQNetwork(14, (4, 4, 4), (5, 3, 3), (2, 1, 1), 16, dueling)
+    pixel = PixelQNetwork(14, (4, 4, 4), (5, 3, 3), (2, 1, 1), 2, 16, dueling)
     packed = jnp.arange(2 * 64 * 64, dtype=jnp.uint32).reshape(2, 64, 64)
     feature = FeatureQNetwork(14, 16, dueling)
     for network, obs in ((pixel, packed), (feature, jnp.ones((2, 21)))):
@@ -44,7 +44,7 @@ def test_networks_give_a_value_an_action(dueling):
 
 
 def test_geom_ids_are_not_shown_to_the_network():
-    network = PixelQNetwork(14, (4, 4, 4), (5, 3, 3), (2, 1, 1), 16, False)
+    network = PixelQNetwork(14, (4, 4, 4), (5, 3, 3), (2, 1, 1), 2, 16, False)
     packed = jnp.full((1, 64, 64), 0x00336699, jnp.uint32)
     params = network.init(jax.random.key(0), packed)
     marked = packed | jnp.uint32(7 << 24)

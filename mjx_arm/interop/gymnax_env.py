@@ -19,7 +19,7 @@ except ImportError as error:
     raise ImportError("gymnax is not installed: pip install 'mjx_arm[gymnax]'") from error
 
 
-class GymnaxEnv(Environment):  # type: ignore[misc]  # gymnax ships no types
+class GymnaxEnv(Environment):
     """An environment of gymnax 1.0: `step` gives six values and resets in the same step.
 
     `info["final_observation"]` has the true last observation of an episode, at every step. In
@@ -35,9 +35,10 @@ class GymnaxEnv(Environment):  # type: ignore[misc]  # gymnax ships no types
 
     def __init__(self, name: str = "A", **options: Any):
         self.env = make(name, **options)
-        self._space = observation_space(self.env)
-        if not isinstance(self._space, gymnasium.spaces.Box):
+        space = observation_space(self.env)
+        if not isinstance(space, gymnasium.spaces.Box):
             raise ValueError("observation 'rgbd' has no gymnax space: give another observation")
+        self._space = space
 
     @property
     def default_params(self) -> EnvParams:
