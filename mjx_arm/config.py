@@ -219,7 +219,7 @@ class TrainConfig:
     seed: int = 0
     num_seeds: int = 1
     num_envs: int = 64
-    total_steps: int = 2_000_000
+    total_steps: int = 5_000_000
     storage: str = "states"
     replay_size: int = 200_000
     batch_size: int = 64

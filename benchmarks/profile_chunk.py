@@ -1,0 +1,157 @@
+"""Where the time of one training step goes, by stage, beside the least it could take.
+
+Each stage runs alone in a `lax.scan`, at the default preset's sizes; the whole step runs last, and
+what the stages do not explain is said. The floor of a stage is its operations over the rate of a
+large matrix product, or its bytes over the rate of a large copy, whichever takes longer; bytes and
+operations are XLA's own count of the compiled stage.
+
+    python benchmarks/profile_chunk.py --json benchmarks/results/profile.json
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import pathlib
+import time
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from machine import machine
+
+import mjx_arm
+from mjx_arm.loop import make_body
+from mjx_arm.physics import compiler_options
+from mjx_arm.replay import sample
+
+
+def best_of(run: Callable[[], Any], repeats: int) -> float:
+    """Seconds of the fastest of several calls, after one that does not count."""
+    jax.block_until_ready(run())
+    seconds = []
+    for _ in range(repeats):
+        started = time.perf_counter()
+        jax.block_until_ready(run())
+        seconds.append(time.perf_counter() - started)
+    return min(seconds)
+
+
+def peaks(repeats: int) -> dict[str, float]:
+    """Operations a second of a large float32 product, and bytes a second of a large copy."""
+    n = 2048
+    a = jnp.ones((n, n), jnp.float32)
+    product = jax.jit(lambda a: a @ a)
+    x = jnp.ones((64_000_000,), jnp.float32)
+    copy = jax.jit(lambda x: x + 1.0)
+    return {
+        "flops_per_s": 2 * n**3 / best_of(lambda: product(a), repeats),
+        "bytes_per_s": 2 * x.nbytes / best_of(lambda: copy(x), repeats),
+    }
+
+
+def stages(config: mjx_arm.TrainConfig) -> dict[str, tuple[Callable[[Any], Any], Any]]:
+    """Each stage as a function from a carry to the next one, with the first carry."""
+    body = make_body(config)
+    env, dqn = body.env, body.dqn
+    state = jax.jit(body.init, compiler_options=compiler_options(env.env.physics))(
+        jax.random.key(0)
+    )
+    key, size = jax.random.key(1), config.batch_size
+    keys = jax.random.split(key, config.num_envs)
+    action = jax.random.randint(key, (config.num_envs,), 0, 14)
+    full = state.replay.replace(count=jnp.int32(config.replay_slots))
+    batch = sample(full, key, size, config.n_step, config.gamma)
+    obs = body.storage.restore(batch.frame)
+
+    def render(envs: Any) -> Any:
+        drawn = jax.vmap(env.env.observe)(envs.env)
+        # Depends on the picture, or nothing would be drawn.
+        shift = 1e-9 * jnp.sum(drawn & 1, axis=(1, 2)).astype(jnp.float32)
+        physics = envs.env.physics
+        poses = physics.poses.replace(geom_xpos=physics.poses.geom_xpos + shift[:, None, None])
+        return envs.replace(env=envs.env.replace(physics=physics.replace(poses=poses)))
+
+    def act(obs: jax.Array) -> jax.Array:
+        q = dqn.apply(state.learner.params, obs)
+        return obs ^ (q[:, :1, None] > 1e9).astype(jnp.uint32)
+
+    def gradient(params: Any) -> Any:
+        def loss(params: Any) -> jax.Array:
+            return jnp.sum(dqn.apply(params, obs) ** 2)
+
+        return jax.tree.map(lambda p, g: p - 1e-9 * g, params, jax.grad(loss)(params))
+
+    def draw_batch(frame: jax.Array) -> jax.Array:
+        drawn = body.storage.restore(frame)
+        return frame + 1e-9 * jnp.sum(drawn & 1, axis=(1, 2)).astype(jnp.float32)[:, None]
+
+    def update(learner: Any) -> Any:
+        return dqn.update(learner, batch, obs, obs[::-1])[0]
+
+    def learn(carry: Any) -> Any:
+        learner, key = carry
+        key, own = jax.random.split(key)
+        return body.learn(own, learner, full)[0], key
+
+    both = jnp.concatenate([batch.frame, batch.next_frame])
+    return {
+        "physics": (lambda envs: jax.vmap(env.transition)(keys, envs, action)[0], state.envs),
+        "render": (render, state.envs),
+        "act: forward": (act, state.obs),
+        "learn: draw the batch": (draw_batch, both),
+        "learn: forward and backward": (gradient, state.learner.params),
+        "learn: update without drawing": (update, state.learner),
+        "learn": (learn, (state.learner, key)),
+        "whole step": (lambda s: body.step(s, None)[0], state.replace(replay=full)),
+    }
+
+
+def profile(
+    stage: Callable[[Any], Any], carry: Any, peak: dict[str, float], options: Any, repeats: int
+) -> dict[str, float]:
+    """Milliseconds of a stage inside a scan, and its floor."""
+    length = 20
+
+    def run(carry: Any) -> Any:
+        return jax.lax.scan(lambda c, _: (stage(c), None), carry, None, length=length)[0]
+
+    compiled = jax.jit(run, compiler_options=options).lower(carry).compile()
+    seconds = best_of(lambda: compiled(carry), repeats) / length
+    # Of one pass: XLA counts the body of a loop once in some versions and each time in others.
+    once = jax.jit(stage, compiler_options=options).lower(carry).compile().cost_analysis() or {}
+    flops, moved = once.get("flops", 0.0), once.get("bytes accessed", 0.0)
+    floor = max(flops / peak["flops_per_s"], moved / peak["bytes_per_s"])
+    return {
+        "ms": round(1e3 * seconds, 3),
+        "floor_ms": round(1e3 * floor, 3),
+        "mflop": round(flops / 1e6, 1),
+        "megabytes": round(moved / 1e6, 1),
+    }
+
+
+def main() -> None:
+    """Measures, prints a table and, where asked to, writes the figures to a file."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--repeats", type=int, default=7)
+    parser.add_argument("--json", type=pathlib.Path, help="file for the figures")
+    options = parser.parse_args()
+    config = mjx_arm.TrainConfig()
+    peak = peaks(options.repeats)
+    print(f"{peak['flops_per_s'] / 1e9:.0f} GFLOP/s, {peak['bytes_per_s'] / 1e9:.1f} GB/s")
+    print(f"{'stage':<32}{'ms':>8}{'floor':>8}{'MFLOP':>9}{'MB':>9}")
+    flags = compiler_options(make_body(config).env.env.physics)
+    rows = []
+    for name, (stage, carry) in stages(config).items():
+        row = profile(stage, carry, peak, flags, options.repeats)
+        rows.append({"stage": name, **row})
+        figures = f"{row['ms']:>8.2f}{row['floor_ms']:>8.2f}{row['mflop']:>9.1f}"
+        print(f"{name:<32}{figures}{row['megabytes']:>9.1f}", flush=True)
+    if options.json:
+        report = {"machine": machine(), "peak": peak, "rows": rows}
+        options.json.write_text(json.dumps(report, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
