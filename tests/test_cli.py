@@ -209,6 +209,7 @@ def test_the_best_agent_is_the_one_that_selection_found(run_folder):
     assert (last.selection_rate, last.env_steps) == (None, 400)
 
 
+@pytest.mark.slow
 def test_seeds_have_folders_of_their_own(tmp_path, capsys):
     folder = tmp_path / "run"
     assert main(["train", *TINY, "--num-seeds", "2", "--seed", "3", "--out", str(folder)]) == 0

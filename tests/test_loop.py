@@ -134,7 +134,7 @@ def test_state_features_train_too():
     assert rows[0]["updates"] > 0
 
 
-@pytest.mark.parametrize("storage", ["states", "pixels"])
+@pytest.mark.parametrize("storage", [pytest.param("states", marks=pytest.mark.slow), "pixels"])
 def test_seeds_side_by_side_are_the_runs_one_by_one(storage):
     config = dataclasses.replace(CONFIG, storage=storage)
     _, both, _ = train(dataclasses.replace(config, num_seeds=2), chunks=0)
