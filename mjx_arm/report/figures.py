@@ -8,6 +8,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from mjx_arm.report.metrics import read_metrics
 
@@ -69,6 +70,7 @@ def _draw(
             axes.plot(run[x_name][known], run[name][known], color=colour, lw=1.4, marker=marker)
         axes.set_title(title, fontsize=10)
         axes.set_xlabel(_AXES[x_name])
+        axes.xaxis.set_major_locator(MaxNLocator(4))
         axes.grid(alpha=0.3)
     figure.savefig(path, dpi=110)
     return path

@@ -45,9 +45,8 @@ def describe(rows: list[dict[str, float]]) -> str:
     parts = [
         f"{metrics['steps_per_s']:,.0f}/s",
         f"success {_percent(metrics['success_rate'])}",
-        f"grasp {_percent(metrics['grasp_share'])}",
         f"max Q {metrics['q_mean']:.1f}",
-        f"loss {metrics['loss']:.4f}",
+        f"loss {metrics['loss']:.3f}",
         f"ε {metrics['epsilon']:.2f}",
     ]
     return " ".join(parts)
