@@ -243,7 +243,7 @@ class TrainConfig:
     strides: tuple[int, int, int] = (2, 1, 1)
     pool: int = 2
     hidden: int = 256
-    chunk_steps: int = 16_384
+    chunk_steps: int = 8_192
     select_every: int = 262_144
     select_episodes: int = 64
 
