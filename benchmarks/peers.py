@@ -19,6 +19,7 @@ os.environ.setdefault("MUJOCO_GL", "egl")
 import argparse
 import copy
 import dataclasses
+import gc
 import json
 import pathlib
 import statistics
@@ -340,6 +341,9 @@ def main() -> None:
             # The first turn compiles and warms up.
             if turn > 0:
                 rates[name].append(rate)
+    # MuJoCo's renderers complain when they outlive the GL that they were made with.
+    contestants.clear()
+    gc.collect()
     for name, values in rates.items():
         low, middle, high = min(values), statistics.median(values), max(values)
         print(f"{name:<44}{middle:>12,.1f} a second ({low:,.1f} to {high:,.1f})")
