@@ -329,7 +329,7 @@ _COUNTS = (
     "select_episodes",
 )
 
-# Starting points of the command line. `fast` reaches 90 % in environment A on two CPU cores;
+# Starting points of the command line. `fast` is meant for 90 % in environment A on two CPU cores;
 # `smoke` shows in minutes that everything works; `paper` has every value that James & Johns 2016
 # state, and where they state none (batch, target period, number of environments) ours.
 PRESETS = {
