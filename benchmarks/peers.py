@@ -238,10 +238,12 @@ def our_agent(config: TrainConfig) -> tuple[Callable[[], float], Callable[[], fl
 
     @jax.jit
     def update(learner: Any, obs: jax.Array, next_obs: jax.Array) -> Any:
-        def once(learner: Any, _: None) -> tuple[Any, None]:
-            return body.dqn.update(learner, batch, obs, next_obs)[0], None
+        # The pictures change places, or their patches would be made once for all updates.
+        def once(carry: Any, _: None) -> tuple[Any, None]:
+            learner, obs, next_obs = carry
+            return (body.dqn.update(learner, batch, obs, next_obs)[0], next_obs, obs), None
 
-        return jax.lax.scan(once, learner, None, length=8)[0]
+        return jax.lax.scan(once, (learner, obs, next_obs), None, length=8)[0]
 
     return (
         count_per_second(lambda: jax.block_until_ready(act(learner.params, obs)), 20 * size),

@@ -46,6 +46,8 @@ class DQN:
       huber: loss of Huber with threshold 1, else half the square.
       polyak: share of the online parameters in each update of the target's, or 0.
       target_period: updates between copies to the target network, where `polyak` is 0.
+      parts: a batch is worked on in so many parts of one size, and the gradients added up; what a
+        part needs in between may fit a cache where that of the batch does not.
     """
 
     apply: Callable[[Params, jax.Array], jax.Array]
@@ -55,6 +57,7 @@ class DQN:
     huber: bool
     polyak: float
     target_period: int
+    parts: int = 1
 
     def policy(self, learner: Learner) -> Params:
         """Parameters to judge and to keep.
@@ -89,18 +92,22 @@ class DQN:
         Returns:
           The learner after, and `loss`, `q_mean` and `target_max`, each `[] float32`.
         """
-        next_q = self.apply(learner.target_params, next_obs)
-        chooser = self.apply(learner.params, next_obs) if self.double else next_q
-        targets = jax.vmap(td_target)(batch.reward, batch.discount, next_q, chooser)
-
-        def loss_of(params: Params) -> tuple[jax.Array, jax.Array]:
-            q = self.apply(params, obs)
-            errors = jax.vmap(td_error)(q, batch.action, targets)
-            losses = jax.vmap(huber if self.huber else half_square)(errors)
-            total = jnp.maximum(jnp.sum(batch.weight), 1.0)
-            return jnp.sum(batch.weight * losses) / total, jnp.mean(jnp.max(q, axis=-1))
-
-        (loss, q_mean), grads = jax.value_and_grad(loss_of, has_aux=True)(learner.params)
+        total = jnp.maximum(jnp.sum(batch.weight), 1.0)
+        rows = (batch.action, batch.reward, batch.discount, batch.weight / total, obs, next_obs)
+        if self.parts == 1:
+            grads, metrics = self._gradients(learner, *rows)
+        else:
+            shape = (self.parts, len(batch.action) // self.parts)
+            rows = jax.tree.map(lambda x: x.reshape(*shape, *x.shape[1:]), rows)
+            zeros = jax.tree.map(jnp.zeros_like, learner.params)
+            grads, each = jax.lax.scan(
+                lambda grads, row: _add_first(grads, self._gradients(learner, *row)), zeros, rows
+            )
+            metrics = {
+                "loss": jnp.sum(each["loss"]),
+                "q_mean": jnp.mean(each["q_mean"]),
+                "target_max": jnp.max(each["target_max"]),
+            }
         # Adam's bias correction raises a float to an integer power; strict promotion is for ours.
         with jax.numpy_dtype_promotion("standard"):
             changes, opt_state = self.optimizer.update(grads, learner.opt_state, learner.params)
@@ -112,12 +119,41 @@ class DQN:
             opt_state=opt_state,
             updates=updates,
         )
-        return learner, {"loss": loss, "q_mean": q_mean, "target_max": jnp.max(targets)}
+        return learner, metrics
+
+    def _gradients(
+        self,
+        learner: Learner,
+        action: jax.Array,
+        reward: jax.Array,
+        discount: jax.Array,
+        weight: jax.Array,
+        obs: jax.Array,
+        next_obs: jax.Array,
+    ) -> tuple[Params, dict[str, jax.Array]]:
+        """The gradient of the weighted sum of losses over some rows of a batch, and metrics."""
+        next_q = self.apply(learner.target_params, next_obs)
+        chooser = self.apply(learner.params, next_obs) if self.double else next_q
+        targets = jax.vmap(td_target)(reward, discount, next_q, chooser)
+
+        def loss_of(params: Params) -> tuple[jax.Array, jax.Array]:
+            q = self.apply(params, obs)
+            errors = jax.vmap(td_error)(q, action, targets)
+            losses = jax.vmap(huber if self.huber else half_square)(errors)
+            return jnp.sum(weight * losses), jnp.mean(jnp.max(q, axis=-1))
+
+        (loss, q_mean), grads = jax.value_and_grad(loss_of, has_aux=True)(learner.params)
+        return grads, {"loss": loss, "q_mean": q_mean, "target_max": jnp.max(targets)}
 
     def _sync(self, target_params: Params, params: Params, updates: jax.Array) -> Params:
         if self.polyak > 0.0:
             return optax.incremental_update(params, target_params, self.polyak)
         return optax.periodic_update(params, target_params, updates, self.target_period)
+
+
+def _add_first(total: Params, result: tuple[Params, Any]) -> tuple[Params, Any]:
+    grads, rest = result
+    return jax.tree.map(jnp.add, total, grads), rest
 
 
 def td_target(

@@ -151,7 +151,19 @@ def make_dqn(config: TrainConfig, env: Env) -> DQN:
         huber=config.huber,
         polyak=config.polyak,
         target_period=config.target_period,
+        parts=_parts(config),
     )
+
+
+def _parts(config: TrainConfig) -> int:
+    """Parts of a batch for an update: on CPU of 16 images, whose patches fit the cache of a core.
+
+    Four parts of 16 take three quarters of the time of 64 at once (see benchmarks/PROFILE.md).
+    """
+    pixels = config.observation != "state"
+    if pixels and jax.default_backend() == "cpu" and config.batch_size % 16 == 0:
+        return config.batch_size // 16
+    return 1
 
 
 def epsilon_at(config: TrainConfig, env_steps: jax.Array) -> jax.Array:

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,7 +9,7 @@ import optax
 import pytest
 
 from mjx_arm.dqn import DQN, epsilon_greedy, half_square, huber, td_error, td_target
-from mjx_arm.replay import Step, add, init_replay, sample
+from mjx_arm.replay import Batch, Step, add, init_replay, sample
 
 GAMMA = 0.9
 
@@ -38,6 +40,27 @@ def test_epsilon_is_the_share_of_random_actions():
     for epsilon in (0.0, 0.4, 1.0):
         actions = np.asarray(epsilon_greedy(jax.random.key(0), q, jnp.float32(epsilon)))
         assert (actions != 1).mean() == pytest.approx(0.75 * epsilon, abs=0.02)
+
+
+def test_an_update_in_parts_is_an_update():
+    dqn = make_tabular(polyak=0.05)
+    learner = dqn.init(jax.random.key(0), jnp.zeros(1))
+    learner = dataclasses.replace(learner, target_params=learner.params + 1.0)
+    keys = iter(jax.random.split(jax.random.key(1), 8))
+    obs, next_obs = jax.random.randint(next(keys), (2, 32), 0, 2).astype(jnp.float32)
+    batch = Batch(
+        frame=obs,
+        next_frame=next_obs,
+        action=jax.random.randint(next(keys), (32,), 0, 2),
+        reward=jax.random.normal(next(keys), (32,)),
+        discount=jax.random.uniform(next(keys), (32,)),
+        weight=jax.random.bernoulli(next(keys), 0.8, (32,)).astype(jnp.float32),
+    )
+    whole, parts = (
+        dataclasses.replace(dqn, parts=n).update(learner, batch, obs, next_obs) for n in (1, 4)
+    )
+    for one, other in zip(jax.tree.leaves(whole), jax.tree.leaves(parts), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-5, atol=1e-6)
 
 
 def make_tabular(polyak=0.0, target_period=20, double=True) -> DQN:

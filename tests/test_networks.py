@@ -6,7 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjx_arm.networks import FeatureQNetwork, PatchConv, PixelQNetwork, max_pool
+from mjx_arm.convolution import max_pool
+from mjx_arm.networks import FeatureQNetwork, PatchConv, PixelQNetwork
 
 
 @pytest.mark.parametrize(("kernel", "stride"), [(5, 2), (3, 1), (4, 2), (4, 3), (1, 1)])
@@ -26,9 +27,26 @@ def test_patch_convolution_equals_flax(kernel, stride, size):
         np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-4)
 
 
-def test_max_pool_equals_flax():
-    x = jax.random.normal(jax.random.key(0), (2, 9, 8, 3))
-    np.testing.assert_array_equal(max_pool(x, 2), nn.max_pool(x, (2, 2), (2, 2)))
+@pytest.mark.parametrize("size", [1, 2, 3])
+def test_max_pool_equals_flax(size):
+    # Few values, so that many windows have several maxima: the first gets the gradient.
+    x = jax.random.randint(jax.random.key(0), (2, 9, 8, 3), 0, 4).astype(jnp.float32)
+
+    def theirs(x):
+        return nn.max_pool(x, (size, size), (size, size))
+
+    np.testing.assert_array_equal(max_pool(x, size), theirs(x))
+    grad = jax.random.normal(jax.random.key(1), theirs(x).shape)
+    ours = jax.vjp(lambda x: max_pool(x, size), x)[1](grad)[0]
+    np.testing.assert_array_equal(ours, jax.vjp(theirs, x)[1](grad)[0])
+
+
+def test_pooling_before_the_bias_changes_no_value():
+    x = jax.random.normal(jax.random.key(0), (2, 16, 16, 3))
+    params = PatchConv(8, 3).init(jax.random.key(1), x)
+    params["params"]["bias"] = jax.random.normal(jax.random.key(2), (8,))
+    pooled = PatchConv(8, 3, pool=2).apply(params, x)
+    np.testing.assert_array_equal(pooled, max_pool(PatchConv(8, 3).apply(params, x), 2))
 
 
 @pytest.mark.parametrize("dueling", [False, True])
