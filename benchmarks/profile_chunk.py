@@ -1,9 +1,9 @@
 """Where the time of one training step goes, by stage, beside the least it could take.
 
-Each stage runs alone in a `lax.scan`, at the default preset's sizes; the whole step runs last, and
-what the stages do not explain is said. The floor of a stage is its operations over the rate of a
-large matrix product, or its bytes over the rate of a large copy, whichever takes longer; bytes and
-operations are XLA's own count of the compiled stage.
+Each stage runs alone in a `lax.scan`, at the default preset's sizes, and the whole step last. The
+floor of a stage is its operations over the rate of a large matrix product, or the bytes that it
+must read and write over the rate of a large copy, whichever takes longer. Operations are XLA's own
+count; the bytes are those of what the stage takes and gives, not of what it keeps in between.
 
     python benchmarks/profile_chunk.py --json benchmarks/results/profile.json
 """
@@ -11,6 +11,7 @@ operations are XLA's own count of the compiled stage.
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import json
 import pathlib
 import time
@@ -22,7 +23,8 @@ import jax.numpy as jnp
 from machine import machine
 
 import mjx_arm
-from mjx_arm.loop import make_body
+from mjx_arm.loop import Body, LoopState, make_body
+from mjx_arm.memory import tree_size
 from mjx_arm.physics import compiler_options
 from mjx_arm.replay import sample
 
@@ -51,9 +53,9 @@ def peaks(repeats: int) -> dict[str, float]:
     }
 
 
-def stages(config: mjx_arm.TrainConfig) -> dict[str, tuple[Callable[[Any], Any], Any]]:
+def stages(body: Body) -> dict[str, tuple[Callable[[Any], Any], Any]]:
     """Each stage as a function from a carry to the next one, with the first carry."""
-    body = make_body(config)
+    config = body.config
     env, dqn = body.env, body.dqn
     state = jax.jit(body.init, compiler_options=compiler_options(env.env.physics))(
         jax.random.key(0)
@@ -63,7 +65,7 @@ def stages(config: mjx_arm.TrainConfig) -> dict[str, tuple[Callable[[Any], Any],
     action = jax.random.randint(key, (config.num_envs,), 0, 14)
     full = state.replay.replace(count=jnp.int32(config.replay_slots))
     batch = sample(full, key, size, config.n_step, config.gamma)
-    obs = body.storage.restore(batch.frame)
+    obs, next_obs = body.storage.restore(batch.frame), body.storage.restore(batch.next_frame)
 
     def render(envs: Any) -> Any:
         drawn = jax.vmap(env.env.observe)(envs.env)
@@ -77,18 +79,23 @@ def stages(config: mjx_arm.TrainConfig) -> dict[str, tuple[Callable[[Any], Any],
         q = dqn.apply(state.learner.params, obs)
         return obs ^ (q[:, :1, None] > 1e9).astype(jnp.uint32)
 
-    def gradient(params: Any) -> Any:
+    # The pictures change places, or what depends on them alone would be made once for all passes.
+    def gradient(carry: Any) -> Any:
+        params, obs, next_obs = carry
+
         def loss(params: Any) -> jax.Array:
             return jnp.sum(dqn.apply(params, obs) ** 2)
 
-        return jax.tree.map(lambda p, g: p - 1e-9 * g, params, jax.grad(loss)(params))
+        params = jax.tree.map(lambda p, g: p - 1e-9 * g, params, jax.grad(loss)(params))
+        return params, next_obs, obs
 
     def draw_batch(frame: jax.Array) -> jax.Array:
         drawn = body.storage.restore(frame)
         return frame + 1e-9 * jnp.sum(drawn & 1, axis=(1, 2)).astype(jnp.float32)[:, None]
 
-    def update(learner: Any) -> Any:
-        return dqn.update(learner, batch, obs, obs[::-1])[0]
+    def update(carry: Any) -> Any:
+        learner, obs, next_obs = carry
+        return dqn.update(learner, batch, obs, next_obs)[0], next_obs, obs
 
     def learn(carry: Any) -> Any:
         learner, key = carry
@@ -101,17 +108,25 @@ def stages(config: mjx_arm.TrainConfig) -> dict[str, tuple[Callable[[Any], Any],
         "render": (render, state.envs),
         "act: forward": (act, state.obs),
         "learn: draw the batch": (draw_batch, both),
-        "learn: forward and backward": (gradient, state.learner.params),
-        "learn: update without drawing": (update, state.learner),
+        "learn: forward and backward": (gradient, (state.learner.params, obs, next_obs)),
+        "learn: update without drawing": (update, (state.learner, obs, next_obs)),
         "learn": (learn, (state.learner, key)),
         "whole step": (lambda s: body.step(s, None)[0], state.replace(replay=full)),
     }
 
 
 def profile(
-    stage: Callable[[Any], Any], carry: Any, peak: dict[str, float], options: Any, repeats: int
+    stage: Callable[[Any], Any],
+    whole: Callable[[Any], Any],
+    carry: Any,
+    peak: dict[str, float],
+    options: Any,
+    repeats: int,
 ) -> dict[str, float]:
-    """Milliseconds of a stage inside a scan, and its floor."""
+    """Milliseconds of a stage inside a scan, and its floor.
+
+    `whole` is the stage with each batch in one part: XLA counts the body of a loop once.
+    """
     length = 20
 
     def run(carry: Any) -> Any:
@@ -119,9 +134,11 @@ def profile(
 
     compiled = jax.jit(run, compiler_options=options).lower(carry).compile()
     seconds = best_of(lambda: compiled(carry), repeats) / length
-    # Of one pass: XLA counts the body of a loop once in some versions and each time in others.
-    once = jax.jit(stage, compiler_options=options).lower(carry).compile().cost_analysis() or {}
-    flops, moved = once.get("flops", 0.0), once.get("bytes accessed", 0.0)
+    once = jax.jit(whole, compiler_options=options).lower(carry).compile().cost_analysis() or {}
+    flops = once.get("flops", 0.0)
+    # Of the replay a step touches next to nothing.
+    touched = carry.replace(replay=None) if isinstance(carry, LoopState) else carry
+    moved = 2 * tree_size(touched)
     floor = max(flops / peak["flops_per_s"], moved / peak["bytes_per_s"])
     return {
         "ms": round(1e3 * seconds, 3),
@@ -141,10 +158,12 @@ def main() -> None:
     peak = peaks(options.repeats)
     print(f"{peak['flops_per_s'] / 1e9:.0f} GFLOP/s, {peak['bytes_per_s'] / 1e9:.1f} GB/s")
     print(f"{'stage':<32}{'ms':>8}{'floor':>8}{'MFLOP':>9}{'MB':>9}")
-    flags = compiler_options(make_body(config).env.env.physics)
+    body = make_body(config)
+    flags = compiler_options(body.env.env.physics)
+    in_one = stages(dataclasses.replace(body, dqn=dataclasses.replace(body.dqn, parts=1)))
     rows = []
-    for name, (stage, carry) in stages(config).items():
-        row = profile(stage, carry, peak, flags, options.repeats)
+    for name, (stage, carry) in stages(body).items():
+        row = profile(stage, in_one[name][0], carry, peak, flags, options.repeats)
         rows.append({"stage": name, **row})
         figures = f"{row['ms']:>8.2f}{row['floor_ms']:>8.2f}{row['mflop']:>9.1f}"
         print(f"{name:<32}{figures}{row['megabytes']:>9.1f}", flush=True)

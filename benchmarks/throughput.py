@@ -1,20 +1,25 @@
 """Throughput of each stage of training, alone and together, over numbers of environments.
 
     python benchmarks/throughput.py --json benchmarks/results/throughput.json
+    python benchmarks/throughput.py --gpu --json benchmarks/results/gpu.json
 
 Stages: `physics`, `render`, `physics+render`, `act` (the network on one observation of every
 environment), `learn` (one update: sampling, drawing and the gradient step) and `train` (the whole
 loop). Each figure is the median of repeated chunks after a warm-up, with the least and the most
-beside it. With `--json` a log-log plot is written next to the file.
+beside it; memory is that of a run, at its peak, beside the plan that it prints. With `--json` rows
+are written as they come, and a log-log plot next to the file.
 """
 
 from __future__ import annotations
 
 import argparse
+import concurrent.futures
 import dataclasses
+import gc
+import itertools
 import json
+import multiprocessing
 import pathlib
-import resource
 import statistics
 import time
 from collections.abc import Callable, Iterator
@@ -27,38 +32,85 @@ from machine import machine
 from matplotlib.figure import Figure
 
 import mjx_arm
-from mjx_arm.loop import make_body, make_trainer
-from mjx_arm.memory import memory_plan
+from mjx_arm.config import BACKENDS
+from mjx_arm.loop import Trainer, make_body, make_trainer
+from mjx_arm.memory import memory_plan, working_memory
 from mjx_arm.physics import compiler_options
 
 STAGES = ("physics", "render", "physics+render", "act", "learn", "train")
 NUM_ENVS = (16, 64, 256, 1024, 4096, 16384)
-# Environment steps, frames or decisions of one timed chunk.
-_WORK = 8192
 _UPDATES = 8
 
 
-def time_chunks(
-    run: Callable[[Any], Any], state: Any, work: int, repeats: int, options: Any, donate: bool
-) -> dict[str, float]:
-    """Rates of `work` units a call: median, least and most of the repeats, and compile time."""
+def compile_chunk(
+    run: Callable[[Any], Any], state: Any, options: Any, *, donate: bool
+) -> tuple[jax.stages.Compiled, float]:
+    """The compiled chunk, for a state or its shapes, and the seconds that it took."""
     started = time.perf_counter()
     jitted = jax.jit(run, donate_argnums=0 if donate else (), compiler_options=options)
     compiled = jitted.lower(state).compile()
-    compile_s = time.perf_counter() - started
-    # Donated, the state of one chunk is the next one's.
-    result = jax.block_until_ready(compiled(state))
+    return compiled, round(time.perf_counter() - started, 2)
+
+
+def time_chunks(run: Callable[[], Any], work: int, repeats: int) -> dict[str, int]:
+    """Rates of `work` units a call after one that does not count: median, least and most."""
+    jax.block_until_ready(run())
     rates = []
     for _ in range(repeats):
         started = time.perf_counter()
-        result = jax.block_until_ready(compiled(result if donate else state))
+        jax.block_until_ready(run())
         rates.append(work / (time.perf_counter() - started))
-    return {
-        "steps_per_s": round(statistics.median(rates)),
-        "least": round(min(rates)),
-        "most": round(max(rates)),
-        "compile_s": round(compile_s, 2),
-    }
+    middle, least, most = statistics.median(rates), min(rates), max(rates)
+    return {"steps_per_s": round(middle), "least": round(least), "most": round(most)}
+
+
+def time_stage(
+    run: Callable[[Any], Any], state: Any, work: int, repeats: int, options: Any
+) -> dict[str, float]:
+    """Rates and compile time of a stage that leaves its state as it is."""
+    compiled, compile_s = compile_chunk(run, state, options, donate=False)
+    return time_chunks(lambda: compiled(state), work, repeats) | {"compile_s": compile_s}
+
+
+def peak_memory(config: mjx_arm.TrainConfig) -> dict[str, int]:
+    """Bytes that training comes to hold beyond what the process held once it was compiled.
+
+    On CPU by the growth of the resident set, whose high-water mark Linux can reset; elsewhere by
+    the device's own count.
+    """
+    trainer = make_trainer(config)
+    key = jax.random.key(0)
+    shapes = jax.eval_shape(trainer.init, key)
+    init, run = trainer.init.lower(key).compile(), trainer.run_chunk.lower(shapes).compile()
+    device = jax.devices()[0]
+    before = 0
+    if device.platform == "cpu":
+        gc.collect()
+        pathlib.Path("/proc/self/clear_refs").write_text("5")
+        before = resident("VmRSS")
+    state = init(key)
+    for _ in range(2):
+        state, _ = run(state)
+    jax.block_until_ready(state)
+    stats = device.memory_stats()
+    peak = stats["peak_bytes_in_use"] if stats else resident("VmHWM") - before
+    planned = sum(memory_plan(shapes).values()) + working_memory(run)
+    return {"planned_bytes": planned, "peak_bytes": peak}
+
+
+def resident(name: str) -> int:
+    """A count of the process's resident memory, bytes: `VmRSS` now, `VmHWM` at its most."""
+    lines = pathlib.Path("/proc/self/status").read_text().splitlines()
+    return next(int(x.split()[1]) * 1024 for x in lines if x.startswith(name))
+
+
+def peak_memory_apart(config: mjx_arm.TrainConfig) -> dict[str, int]:
+    """The same in a process of its own on CPU: this one holds memory that it could use again."""
+    if jax.default_backend() != "cpu":
+        return peak_memory(config)
+    spawn = multiprocessing.get_context("spawn")
+    with concurrent.futures.ProcessPoolExecutor(1, mp_context=spawn) as pool:
+        return pool.submit(peak_memory, config).result()
 
 
 def env_stages(env: mjx_arm.Env, num_envs: int, length: int) -> dict[str, Callable[[Any], Any]]:
@@ -123,24 +175,23 @@ def agent_stages(config: mjx_arm.TrainConfig, length: int) -> dict[str, Callable
 
 def rows(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
     """Measures; a row a figure."""
-    repeats = 3 if options.quick else 7
-    for shadows in options.shadows:
-        for size in options.sizes:
-            for num_envs in options.num_envs:
-                length = max(2 if options.quick else 4, _WORK // num_envs)
-                common = {"size": size, "shadows": shadows, "num_envs": num_envs}
-                yield from env_rows(options, common, length, repeats)
-                if not shadows:
-                    yield from agent_rows(options, common, length, repeats)
+    repeats = 3 if options.quick or options.gpu else 7
+    cases = itertools.product(options.shadows, options.sizes, options.num_envs, options.physics)
+    for shadows, size, num_envs, physics in cases:
+        length = max(2 if options.quick else 4, options.work // num_envs)
+        common = {"size": size, "shadows": shadows, "num_envs": num_envs}
+        yield from env_rows(options, physics, common, length, repeats)
+        if not shadows:
+            yield from agent_rows(options, physics, common, length, repeats)
 
 
 def env_rows(
-    options: argparse.Namespace, common: dict[str, Any], length: int, repeats: int
+    options: argparse.Namespace, physics: str, common: dict[str, Any], length: int, repeats: int
 ) -> Iterator[dict[str, Any]]:
     """Rows of the stages of the environment."""
     size, shadows, num_envs = common["size"], common["shadows"], common["num_envs"]
     env = mjx_arm.make(
-        "B", physics=options.physics, observation="packed", size=(size, size), shadows=shadows
+        "B", physics=physics, observation="packed", size=(size, size), shadows=shadows
     )
     flags = compiler_options(env.physics)
     state = jax.jit(jax.vmap(mjx_arm.AutoReset(env).reset), compiler_options=flags)(
@@ -148,52 +199,69 @@ def env_rows(
     )[1]
     for stage, run in env_stages(env, num_envs, length).items():
         if stage in options.stages and not (shadows and stage == "physics"):
-            figures = time_chunks(run, state, num_envs * length, repeats, flags, donate=False)
+            figures = time_stage(run, state, num_envs * length, repeats, flags)
             yield {"stage": stage, **describe(env), **common, **figures}
 
 
 def agent_rows(
-    options: argparse.Namespace, common: dict[str, Any], length: int, repeats: int
+    options: argparse.Namespace, physics: str, common: dict[str, Any], length: int, repeats: int
 ) -> Iterator[dict[str, Any]]:
     """Rows of the stages of the agent, for both storages where that matters."""
     size, num_envs = common["size"], common["num_envs"]
     for storage in options.storages:
         config = mjx_arm.TrainConfig(
             env="B",
-            physics=options.physics,
+            physics=physics,
             size=(size, size),
             num_envs=num_envs,
+            batch_size=options.batch_size,
             storage=storage,
             # Enough for the longest chunk; pixels of more would not fit everywhere.
             replay_size=max(20_000, 8 * num_envs) if storage == "pixels" else 200_000,
             learning_starts=0,
             chunk_steps=num_envs * length,
         )
-        # One update for each 64 steps, the default's ratio of samples to steps.
-        config = dataclasses.replace(config, updates_per_step=max(1, num_envs // 64))
+        # A sample for each step, the default's ratio.
+        updates = max(1, num_envs // options.batch_size)
+        config = dataclasses.replace(config, updates_per_step=updates)
         trainer = make_trainer(config)
         flags = compiler_options(trainer.env.physics)
-        state = trainer.init(jax.random.key(0))
-        plan = sum(memory_plan(state).values())
-        named = {**describe(trainer.env), **common, "storage": storage, "planned_bytes": plan}
-        for stage, run in agent_stages(config, length).items():
-            if stage in options.stages and (stage == "learn" or storage == "states"):
-                work = _UPDATES if stage == "learn" else num_envs * length
-                figures = time_chunks(run, state, work, repeats, flags, donate=False)
-                yield {"stage": stage, "batch_size": config.batch_size, **named, **figures}
+        named = {**describe(trainer.env), **common, "storage": storage}
+        named["batch_size"] = config.batch_size
         if "train" in options.stages:
-            # Twice, for the replay must fill before the first update.
-            run = make_body(config).run_chunk
-            figures = time_chunks(
-                lambda state, run=run: run(state)[0],
-                state,
-                num_envs * length,
-                repeats,
-                flags,
-                donate=True,
-            )
-            ratio = config.updates_per_step * config.batch_size / num_envs
-            yield {"stage": "train", "samples_per_step": ratio, **named, **figures}
+            # Memory first: an accelerator's count starts with the process.
+            memory = peak_memory_apart(config)
+            yield {"stage": "train", **named, **time_training(trainer, repeats), **memory}
+        if {"act", "learn"} & set(options.stages):
+            state = trainer.init(jax.random.key(0))
+            for stage, run in agent_stages(config, length).items():
+                if stage in options.stages and (stage == "learn" or storage == "states"):
+                    work = _UPDATES if stage == "learn" else num_envs * length
+                    figures = time_stage(run, state, work, repeats, flags)
+                    yield {"stage": stage, **named, **figures}
+
+
+def time_training(trainer: Trainer, repeats: int) -> dict[str, float]:
+    """Rates of the whole loop."""
+    config = trainer.config
+    shapes = jax.eval_shape(trainer.init, jax.random.key(0))
+    flags = compiler_options(trainer.env.physics)
+    compiled, compile_s = compile_chunk(make_body(config).run_chunk, shapes, flags, donate=True)
+    # The state of one chunk is the next one's.
+    state = [trainer.init(jax.random.key(0))]
+
+    def run() -> Any:
+        state[0], counts = compiled(state[0])
+        return counts
+
+    # Once more, for the replay must fill before the first update.
+    jax.block_until_ready(run())
+    figures = time_chunks(run, config.chunk_length * config.num_envs, repeats)
+    return {
+        "samples_per_step": config.updates_per_step * config.batch_size / config.num_envs,
+        **figures,
+        "compile_s": compile_s,
+    }
 
 
 def describe(env: mjx_arm.Env) -> dict[str, Any]:
@@ -206,18 +274,29 @@ def describe(env: mjx_arm.Env) -> dict[str, Any]:
     }
 
 
+def memory(row: dict[str, Any]) -> str:
+    """What the table says of the memory of a row."""
+    if "peak_bytes" not in row:
+        return ""
+    peak, share = row["peak_bytes"] / 1e6, row["peak_bytes"] / row["planned_bytes"]
+    return f"   {peak:,.0f} MB, {100 * share:.0f} %"
+
+
 def plot(rows: list[dict[str, Any]], path: pathlib.Path) -> None:
     """Log-log plot of the figures of 64 by 64 pixels without shadows."""
     figure = Figure(figsize=(7, 4.5), layout="constrained")
     axes = figure.subplots()
     chosen = [row for row in rows if row["size"] == 64 and not row["shadows"]]
-    for stage in STAGES:
-        own = [r for r in chosen if r["stage"] == stage and r.get("storage", "states") == "states"]
+    chosen = [row for row in chosen if row.get("storage", "states") == "states"]
+    backends = sorted({row["backend"] for row in chosen})
+    for stage, backend in itertools.product(STAGES, backends):
+        own = [row for row in chosen if (row["stage"], row["backend"]) == (stage, backend)]
         if stage != "learn" and own:
+            label = stage if len(backends) == 1 else f"{stage}, {backend}"
             x, y = ([row[name] for row in own] for name in ("num_envs", "steps_per_s"))
             low, high = (np.asarray([row[name] for row in own]) for name in ("least", "most"))
             spread = [np.asarray(y) - low, high - np.asarray(y)]
-            axes.errorbar(x, y, spread, marker="o", markersize=4, capsize=2, label=stage)
+            axes.errorbar(x, y, spread, marker="o", markersize=4, capsize=2, label=label)
     axes.set(xscale="log", yscale="log", xlabel="environments", ylabel="steps or frames per second")
     axes.grid(alpha=0.3, which="both")
     axes.legend()
@@ -229,39 +308,58 @@ def parse() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="within 2 minutes on two cores")
     parser.add_argument("--json", type=pathlib.Path, help="file for the rows")
-    parser.add_argument("--physics", default="auto", help="backend")
+    parser.add_argument("--gpu", action="store_true", help="MJX and MJX-Warp on NVIDIA, 10 minutes")
+    parser.add_argument("--batch-size", type=int, help="of an update")
+    parser.add_argument("--minutes", type=float, help="begin no figure after that")
+    parser.add_argument("--work", type=int, default=8192, help="environment steps of a timed chunk")
+    parser.add_argument("--physics", nargs="+", choices=BACKENDS, help="backends")
     parser.add_argument("--stages", nargs="+", choices=STAGES, default=STAGES)
     parser.add_argument("--num-envs", nargs="+", type=int)
     parser.add_argument("--sizes", nargs="+", type=int, default=[64], help="edges, pixels")
     parser.add_argument("--storages", nargs="+", choices=("states", "pixels"))
     parser.add_argument("--shadows", nargs="+", type=int, choices=(0, 1))
     options = parser.parse_args()
-    quick = options.quick
-    options.num_envs = options.num_envs or ([64] if quick else list(NUM_ENVS))
-    options.storages = options.storages or (["states"] if quick else ["states", "pixels"])
-    options.shadows = [bool(x) for x in options.shadows or ([0] if quick else [0, 1])]
+    few = options.quick or options.gpu
+    if options.gpu:
+        if jax.default_backend() != "gpu":
+            parser.error(f"--gpu needs an NVIDIA GPU, and jax runs on {jax.default_backend()}")
+        options.num_envs = options.num_envs or [1024, 8192]
+        options.physics = options.physics or ["mjx", "mjx-warp"]
+        options.minutes = options.minutes or 9.0
+        options.work = max(options.work, 131_072)
+        options.batch_size = options.batch_size or 1024
+    options.physics = options.physics or ["auto"]
+    options.batch_size = options.batch_size or 64
+    options.num_envs = options.num_envs or ([64] if options.quick else list(NUM_ENVS))
+    options.storages = options.storages or (["states"] if few else ["states", "pixels"])
+    options.shadows = [bool(x) for x in options.shadows or ([0] if few else [0, 1])]
     return options
 
 
 def main() -> None:
     """Measures and prints a table; with `--json` writes the rows and a plot."""
-    options, done = parse(), []
-    print(f"{'stage':<16}{'storage':<9}{'shadows':<9}{'envs':>6}{'per second':>12}", end="")
-    print(f"{'least':>9}{'most':>9}{'compile s':>11}")
+    options, done, started = parse(), [], time.monotonic()
+    print(
+        f"{'stage':<16}{'storage':<9}{'shadows':<9}{'envs':>6}{'physics':>10}{'per second':>12}",
+        end="",
+    )
+    print(f"{'least':>9}{'most':>9}{'compile s':>11}   memory at its peak, of the plan")
     for row in rows(options):
         done.append(row)
         print(
             f"{row['stage']:<16}{row.get('storage', ''):<9}{row['shadows']!s:<9}"
-            f"{row['num_envs']:>6}{row['steps_per_s']:>12,}{row['least']:>9,}{row['most']:>9,}"
-            f"{row['compile_s']:>11}",
+            f"{row['num_envs']:>6}{row['backend']:>10}{row['steps_per_s']:>12,}{row['least']:>9,}{row['most']:>9,}"
+            f"{row['compile_s']:>11}{memory(row)}",
             flush=True,
         )
         if options.json:
             options.json.parent.mkdir(parents=True, exist_ok=True)
-            peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
-            report = {"machine": machine(), "peak_resident_bytes": peak, "rows": done}
+            report = {"machine": machine(), "rows": done}
             options.json.write_text(json.dumps(report, indent=1) + "\n")
             plot(done, options.json.with_suffix(".png"))
+        if options.minutes and time.monotonic() - started > 60 * options.minutes:
+            print(f"stopped after {options.minutes:g} minutes")
+            break
 
 
 if __name__ == "__main__":

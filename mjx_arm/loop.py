@@ -69,8 +69,8 @@ class Trainer:
     config: TrainConfig
     env: Env
     dqn: DQN
-    init: Callable[[jax.Array], LoopState]
-    run_chunk: Callable[[LoopState], tuple[LoopState, Counts]]
+    init: jax.stages.Wrapped
+    run_chunk: jax.stages.Wrapped
 
 
 def make_trainer(config: TrainConfig) -> Trainer:

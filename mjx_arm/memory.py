@@ -13,7 +13,13 @@ _FIELDS = ("learner", "envs", "obs", "replay")
 
 def memory_plan(state: Any) -> dict[str, int]:
     """Bytes of each part of a `LoopState`, or of its shapes from `jax.eval_shape`."""
-    return {name: _size(getattr(state, name)) for name in _FIELDS}
+    return {name: tree_size(getattr(state, name)) for name in _FIELDS}
+
+
+def working_memory(compiled: jax.stages.Compiled) -> int:
+    """Bytes that a compiled program needs beside its arguments and results while it runs."""
+    analysis = compiled.memory_analysis()
+    return int(analysis.temp_size_in_bytes) if analysis else 0
 
 
 def check_memory(plan: dict[str, int]) -> None:
@@ -42,7 +48,8 @@ def free_memory() -> int | None:
     return stats["bytes_limit"] - stats["bytes_in_use"] if stats else None
 
 
-def _size(tree: Any) -> int:
+def tree_size(tree: Any) -> int:
+    """Bytes of the arrays of a tree, or of their shapes."""
     total = 0
     for leaf in jax.tree.leaves(tree):
         itemsize = (

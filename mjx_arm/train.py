@@ -31,10 +31,16 @@ from mjx_arm.checkpoint import RunCheckpoints
 from mjx_arm.config import TrainConfig
 from mjx_arm.evaluate import Evaluation, evaluate, make_evaluator
 from mjx_arm.loop import Counts, LoopState, Trainer, make_trainer, run_keys, summarise
-from mjx_arm.memory import check_memory, memory_plan
+from mjx_arm.memory import check_memory, memory_plan, working_memory
 from mjx_arm.report.figures import plot_curves
 from mjx_arm.report.metrics import MetricsWriter, keep_metrics, last_wall_s
-from mjx_arm.report.progress import describe, make_progress, say_device, say_memory
+from mjx_arm.report.progress import (
+    describe,
+    make_progress,
+    say_device,
+    say_memory,
+    say_working_memory,
+)
 from mjx_arm.report.video import draw_episode, record_episode, write_video
 
 # Held out: training draws its keys from the run's own seed, and what selects an agent does not
@@ -43,6 +49,7 @@ _SELECTION_SEED = 2_000_003
 _EVALUATION_SEED = 1_000_003
 _EVALUATION_EPSILON = 0.1
 Evaluate = Callable[[Any, int], Evaluation]
+RunChunk = Callable[[LoopState], tuple[LoopState, Counts]]
 # Chunks between two checkpoints.
 _SAVE_EVERY = 10
 
@@ -73,8 +80,9 @@ def train(
     """
     trainer = _prepare(config, console)
     prepare_folder(folder)
+    run_chunk = _compile(trainer, console)
     _save_configs(folder, config)
-    _run(trainer, trainer.init(run_keys(config)), 0, folder, console)
+    _run(trainer, run_chunk, trainer.init(run_keys(config)), 0, folder, console)
     return _finish(folder, config, eval_episodes, console)
 
 
@@ -104,23 +112,38 @@ def resume(
     if total_steps is not None:
         config = dataclasses.replace(config, total_steps=total_steps)
     trainer = _prepare(config, console)
-    like = jax.eval_shape(trainer.init, run_keys(config))
-    state, vector_step = RunCheckpoints(folder).load_newest(like)
+    state, vector_step = RunCheckpoints(folder).load_newest(_shapes(trainer))
+    run_chunk = _compile(trainer, console)
     _save_configs(folder, config)
     for seed_folder in seed_folders(folder, config):
         keep_metrics(seed_folder, vector_step * config.num_envs)
     console.print(f"going on after {vector_step * config.num_envs:,} steps")
-    _run(trainer, state, vector_step // config.chunk_length, folder, console)
+    _run(trainer, run_chunk, state, vector_step // config.chunk_length, folder, console)
     return _finish(folder, config, eval_episodes, console)
 
 
 def _prepare(config: TrainConfig, console: Console) -> Trainer:
     say_device(console)
     trainer = make_trainer(config)
-    plan = memory_plan(jax.eval_shape(trainer.init, run_keys(config)))
+    plan = memory_plan(_shapes(trainer))
     say_memory(console, plan)
     check_memory(plan)
     return trainer
+
+
+def _shapes(trainer: Trainer) -> LoopState:
+    return jax.eval_shape(trainer.init, run_keys(trainer.config))
+
+
+def _compile(trainer: Trainer, console: Console) -> RunChunk:
+    """The compiled chunk; refused where what it needs to work in does not fit beside the state."""
+    console.print("compiling")
+    shapes = _shapes(trainer)
+    compiled = trainer.run_chunk.lower(shapes).compile()
+    plan = memory_plan(shapes) | {"working": working_memory(compiled)}
+    say_working_memory(console, plan)
+    check_memory(plan)
+    return compiled
 
 
 def seed_folders(folder: pathlib.Path, config: TrainConfig) -> list[pathlib.Path]:
@@ -195,7 +218,12 @@ class _Results:
 
 
 def _run(
-    trainer: Trainer, state: LoopState, done: int, folder: pathlib.Path, console: Console
+    trainer: Trainer,
+    run_chunk: RunChunk,
+    state: LoopState,
+    done: int,
+    folder: pathlib.Path,
+    console: Console,
 ) -> None:
     config, checkpoints, started = trainer.config, RunCheckpoints(folder), time.perf_counter()
     per_chunk = config.chunk_length * config.num_envs
@@ -206,7 +234,6 @@ def _run(
         episodes=config.select_episodes,
         epsilon=_EVALUATION_EPSILON,
     )
-    console.print("compiling; the first chunk takes longer")
     with contextlib.ExitStack() as stack:
         interruption = stack.enter_context(_Interruption())
         progress = stack.enter_context(make_progress(console))
@@ -217,7 +244,7 @@ def _run(
         task = progress.add_task("", total=chunks * per_chunk, metrics="")
         for chunk in range(done + 1, chunks + 1):
             before = time.perf_counter()
-            state, counts = trainer.run_chunk(state)
+            state, counts = run_chunk(state)
             counts = jax.device_get(counts)
             seconds = time.perf_counter() - before
             last = chunk == chunks

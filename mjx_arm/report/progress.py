@@ -25,7 +25,13 @@ def say_device(console: Console) -> None:
 def say_memory(console: Console, plan: dict[str, int]) -> None:
     """Says what the run will hold in memory."""
     parts = ", ".join(f"{name} {size / 1e6:.1f} MB" for name, size in plan.items())
-    console.print(f"memory: {parts}; {sum(plan.values()) / 1e6:.1f} MB in all")
+    console.print(f"memory: {parts}; {sum(plan.values()) / 1e6:.1f} MB")
+
+
+def say_working_memory(console: Console, plan: dict[str, int]) -> None:
+    """Says what the run will need beside that, once the compiler knows."""
+    working, total = plan["working"] / 1e6, sum(plan.values()) / 1e6
+    console.print(f"memory: {working:.1f} MB more to work in; {total:.1f} MB in all")
 
 
 def make_progress(console: Console) -> Progress:
