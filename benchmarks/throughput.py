@@ -35,10 +35,12 @@ import mjx_arm
 from mjx_arm.config import BACKENDS
 from mjx_arm.loop import Trainer, make_body, make_trainer
 from mjx_arm.memory import memory_plan, working_memory
+from mjx_arm.parts import in_parts
 from mjx_arm.physics import compiler_options
 
 STAGES = ("physics", "render", "physics+render", "act", "learn", "train")
 NUM_ENVS = (16, 64, 256, 1024, 4096, 16384)
+# Updates of one timed chunk, at least.
 _UPDATES = 8
 
 
@@ -123,7 +125,7 @@ def env_stages(env: mjx_arm.Env, num_envs: int, length: int) -> dict[str, Callab
         return jax.vmap(auto.transition)(jax.random.split(key, num_envs), state, action)[0]
 
     def draw(state: Any) -> jax.Array:
-        return jax.vmap(env.observe)(state.env)
+        return in_parts(jax.vmap(env.observe))(state.env)
 
     def physics(state: Any) -> Any:
         return jax.lax.scan(lambda s, key: (step(s, key), None), state, keys)[0]
@@ -167,10 +169,14 @@ def agent_stages(config: mjx_arm.TrainConfig, length: int) -> dict[str, Callable
         def once(learner: Any, key: jax.Array) -> tuple[Any, None]:
             return body.learn(key, learner, full)[0], None
 
-        keys = jax.random.split(jax.random.key(2), _UPDATES)
+        keys = jax.random.split(jax.random.key(2), _learn_calls(config))
         return jax.lax.scan(once, state.learner, keys)[0]
 
     return {"act": act, "learn": learn}
+
+
+def _learn_calls(config: mjx_arm.TrainConfig) -> int:
+    return max(1, _UPDATES // config.updates_per_step)
 
 
 def rows(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
@@ -236,7 +242,8 @@ def agent_rows(
             state = trainer.init(jax.random.key(0))
             for stage, run in agent_stages(config, length).items():
                 if stage in options.stages and (stage == "learn" or storage == "states"):
-                    work = _UPDATES if stage == "learn" else num_envs * length
+                    updates = _learn_calls(config) * config.updates_per_step
+                    work = updates if stage == "learn" else num_envs * length
                     figures = time_stage(run, state, work, repeats, flags)
                     yield {"stage": stage, **named, **figures}
 

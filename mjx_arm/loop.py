@@ -18,6 +18,7 @@ from mjx_arm.dqn import DQN, Learner, epsilon_greedy
 from mjx_arm.env import Env, Transition, make_env
 from mjx_arm.kinematics import make_kinematics
 from mjx_arm.networks import FeatureQNetwork, PixelQNetwork
+from mjx_arm.parts import in_parts
 from mjx_arm.physics import compiler_options
 from mjx_arm.replay import Replay, Step, add, init_replay, sample
 
@@ -144,7 +145,7 @@ def make_dqn(config: TrainConfig, env: Env) -> DQN:
     clip = optax.clip_by_global_norm(config.max_grad_norm) if config.max_grad_norm > 0 else None
     adam = optax.adam(config.learning_rate)
     return DQN(
-        apply=network.apply,
+        apply=lambda params, obs: in_parts(lambda part: network.apply(params, part))(obs),
         init_params=network.init,
         optimizer=adam if clip is None else optax.chain(clip, adam),
         double=config.double,
@@ -270,7 +271,7 @@ class Body:
         state = LoopState(
             learner=learner,
             envs=envs,
-            obs=jax.vmap(self.env.env.observe)(envs.env),
+            obs=in_parts(jax.vmap(self.env.env.observe))(envs.env),
             replay=replay,
             key=key,
             vector_step=state.vector_step + 1,

@@ -174,3 +174,12 @@ def test_mjx_trains_too():
     assert rows[-1]["updates"] > 0
     assert rows[-1]["diverged"] == 0
     assert np.isfinite(rows[-1]["loss"])
+
+
+def test_many_observations_get_the_values_that_few_get(run):
+    trainer, state, _ = run
+    params = state.learner.params
+    obs = jax.random.bits(jax.random.key(0), (128, 16, 16), jnp.uint32)
+    together = trainer.dqn.apply(params, obs)
+    apart = [trainer.dqn.apply(params, part) for part in jnp.split(obs, 4)]
+    np.testing.assert_allclose(together, jnp.concatenate(apart), rtol=1e-5, atol=1e-5)
