@@ -10,7 +10,7 @@ import numpy as np
 
 _FIELDS = ("learner", "envs", "obs", "replay")
 # What matrix products pack their operands into, which XLA does not count: measured with
-# benchmarks/throughput.py, 19 to 24 MB from 64 to 4,096 environments.
+# benchmarks/throughput.py, 19 to 22 MB at 64 and 1,024 environments.
 _CPU_WORKSPACE = 20_000_000
 
 
