@@ -176,6 +176,7 @@ def agent_stages(config: mjx_arm.TrainConfig, length: int) -> dict[str, Callable
 
 
 def _learn_calls(config: mjx_arm.TrainConfig) -> int:
+    """Steps of learning in a timed chunk; each has `updates_per_step` updates."""
     return max(1, _UPDATES // config.updates_per_step)
 
 

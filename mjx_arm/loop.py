@@ -152,11 +152,11 @@ def make_dqn(config: TrainConfig, env: Env) -> DQN:
         huber=config.huber,
         polyak=config.polyak,
         target_period=config.target_period,
-        parts=_parts(config),
+        parts=_update_parts(config),
     )
 
 
-def _parts(config: TrainConfig) -> int:
+def _update_parts(config: TrainConfig) -> int:
     """Parts of a batch for an update: on CPU of 16 images, whose patches fit the cache of a core.
 
     Four parts of 16 take three quarters of the time of 64 at once (see benchmarks/PROFILE.md).

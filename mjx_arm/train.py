@@ -112,8 +112,9 @@ def resume(
     if total_steps is not None:
         config = dataclasses.replace(config, total_steps=total_steps)
     trainer = _prepare(config, console)
-    state, vector_step = RunCheckpoints(folder).load_newest(_shapes(trainer))
+    # Before the state is held, or its memory would count as needed and as taken.
     run_chunk = _compile(trainer, console)
+    state, vector_step = RunCheckpoints(folder).load_newest(_shapes(trainer))
     _save_configs(folder, config)
     for seed_folder in seed_folders(folder, config):
         keep_metrics(seed_folder, vector_step * config.num_envs)
