@@ -21,11 +21,45 @@ def in_parts(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
     """
 
     def apply(batch: Any) -> Any:
-        rows = len(jax.tree.leaves(batch)[0])
-        if jax.default_backend() != "cpu" or rows <= _ROWS or rows % _ROWS:
+        rows = _rows(batch)
+        if not _divides(rows):
             return function(batch)
         parts = jax.tree.map(lambda x: x.reshape(-1, _ROWS, *x.shape[1:]), batch)
         results = jax.lax.map(function, parts)
         return jax.tree.map(lambda x: x.reshape(rows, *x.shape[2:]), results)
 
     return apply
+
+
+def overwrite_in_parts(function: Callable[[Any], Any], batch: Any, old: Any) -> Any:
+    """`in_parts(function)(batch)`, written over `old`.
+
+    For the carry of a scan: a result of its own would be filled with zeros first, and copied into
+    the carry last, which for 4,096 images takes as long as a third of drawing them.
+
+    Args:
+      function: as in `in_parts`.
+      batch: tree of arrays `[N, ...]`.
+      old: tree with the shapes and dtypes of the result; its values do not matter.
+    """
+    rows = _rows(batch)
+    if not _divides(rows):
+        return function(batch)
+
+    def write(i: jax.Array, out: Any) -> Any:
+        part = jax.tree.map(lambda x: jax.lax.dynamic_slice_in_dim(x, i * _ROWS, _ROWS), batch)
+        return jax.tree.map(
+            lambda x, y: jax.lax.dynamic_update_slice_in_dim(x, y, i * _ROWS, 0),
+            out,
+            function(part),
+        )
+
+    return jax.lax.fori_loop(0, rows // _ROWS, write, old)
+
+
+def _rows(batch: Any) -> int:
+    return len(jax.tree.leaves(batch)[0])
+
+
+def _divides(rows: int) -> bool:
+    return jax.default_backend() == "cpu" and rows > _ROWS and rows % _ROWS == 0
