@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import argparse
 import concurrent.futures
+import ctypes
 import dataclasses
 import gc
 import itertools
@@ -21,6 +22,7 @@ import json
 import multiprocessing
 import pathlib
 import statistics
+import threading
 import time
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -35,7 +37,7 @@ import mjx_arm
 from mjx_arm.config import BACKENDS
 from mjx_arm.loop import Trainer, make_body, make_trainer
 from mjx_arm.memory import memory_plan, working_memory
-from mjx_arm.parts import in_parts
+from mjx_arm.parts import in_parts, overwrite_in_parts
 from mjx_arm.physics import compiler_options
 
 STAGES = ("physics", "render", "physics+render", "act", "learn", "train")
@@ -77,37 +79,75 @@ def time_stage(
 def peak_memory(config: mjx_arm.TrainConfig) -> dict[str, int]:
     """Bytes that training comes to hold beyond what the process held once it was compiled.
 
-    On CPU by the growth of the resident set, whose high-water mark Linux can reset; elsewhere by
-    the device's own count.
+    On CPU by what of the heap is in use, looked at every millisecond; elsewhere by the device's own
+    count.
     """
     trainer = make_trainer(config)
     key = jax.random.key(0)
     shapes = jax.eval_shape(trainer.init, key)
     init, run = trainer.init.lower(key).compile(), trainer.run_chunk.lower(shapes).compile()
-    device = jax.devices()[0]
-    before = 0
-    if device.platform == "cpu":
-        gc.collect()
-        pathlib.Path("/proc/self/clear_refs").write_text("5")
-        before = resident("VmRSS")
-    state = init(key)
-    for _ in range(2):
-        state, _ = run(state)
-    jax.block_until_ready(state)
-    stats = device.memory_stats()
-    peak = stats["peak_bytes_in_use"] if stats else resident("VmHWM") - before
     planned = sum(memory_plan(shapes).values()) + working_memory(run)
-    return {"planned_bytes": planned, "peak_bytes": peak}
+    gc.collect()
+
+    def train() -> None:
+        state = init(key)
+        for _ in range(2):
+            state, _ = run(state)
+        jax.block_until_ready(state)
+
+    grown = heap_growth(train)
+    stats = jax.devices()[0].memory_stats()
+    peak = stats["peak_bytes_in_use"] if stats else grown
+    return {"planned_bytes": planned} | ({} if peak is None else {"peak_bytes": peak})
 
 
-def resident(name: str) -> int:
-    """A count of the process's resident memory, bytes: `VmRSS` now, `VmHWM` at its most."""
-    lines = pathlib.Path("/proc/self/status").read_text().splitlines()
-    return next(int(x.split()[1]) * 1024 for x in lines if x.startswith(name))
+class _Mallinfo2(ctypes.Structure):
+    """glibc's account of its heap; see mallinfo(3)."""
+
+    # Ten counts, of which two matter: in blocks of their own, and in blocks of the arenas.
+    _fields_ = (
+        ("before", ctypes.c_size_t * 4),
+        ("hblkhd", ctypes.c_size_t),
+        ("between", ctypes.c_size_t * 2),
+        ("uordblks", ctypes.c_size_t),
+        ("after", ctypes.c_size_t * 2),
+    )
+
+
+def heap_growth(run: Callable[[], Any]) -> int | None:
+    """Bytes of the heap in use while `run` works, at their most, beyond those before; glibc only.
+
+    The resident set would not do: a heap keeps pages of what was freed, and hands them out again.
+    """
+    mallinfo2 = getattr(ctypes.CDLL(None), "mallinfo2", None)
+    if mallinfo2 is None:
+        run()
+        return None
+    mallinfo2.restype = _Mallinfo2
+    done = threading.Event()
+    seen: list[int] = []
+
+    def look() -> None:
+        now = mallinfo2()
+        seen.append(now.uordblks + now.hblkhd)
+
+    def keep_looking() -> None:
+        while not done.wait(0.001):
+            look()
+
+    look()
+    watcher = threading.Thread(target=keep_looking)
+    watcher.start()
+    try:
+        run()
+    finally:
+        done.set()
+        watcher.join()
+    return max(seen) - seen[0]
 
 
 def peak_memory_apart(config: mjx_arm.TrainConfig) -> dict[str, int]:
-    """The same in a process of its own on CPU: this one holds memory that it could use again."""
+    """The same in a process of its own on CPU, whose heap nothing else uses."""
     if jax.default_backend() != "cpu":
         return peak_memory(config)
     spawn = multiprocessing.get_context("spawn")
@@ -143,7 +183,7 @@ def env_stages(env: mjx_arm.Env, num_envs: int, length: int) -> dict[str, Callab
     def both(state: Any) -> Any:
         def once(carry: Any, key: jax.Array) -> tuple[Any, None]:
             state = step(carry[0], key)
-            return (state, draw(state)), None
+            return (state, overwrite_in_parts(jax.vmap(env.observe), state.env, carry[1])), None
 
         return jax.lax.scan(once, (state, draw(state)), keys)[0]
 
