@@ -127,7 +127,8 @@ class ArmCubeVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
 
     With `autoreset="next_step"` (gymnasium's default) the step after the end of an episode ignores
     its action and returns the next one's first observation; with `"same_step"` the step that ends
-    it does, and the true last observation is in `info["final_obs"]`.
+    it does, and the true last observation is in `info["final_obs"]`, the rest of what is known of
+    it in `info["final_info"]`.
 
     Args:
       name: environment, `"A"` or `"B"`.
@@ -208,12 +209,13 @@ class ArmCubeVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
             final = info.pop("final_observation")
             masked = dict.fromkeys(info, np.ones(self.num_envs, np.bool_))
             if reset.any():
+                last = dict(info) | {f"_{name}": reset for name in info}
                 rows = [jax.tree.map(lambda x, i=i: x[i], final) for i in range(self.num_envs)]
                 objects = np.empty(self.num_envs, object)
                 for i in np.flatnonzero(reset):
                     objects[i] = rows[i]
-                info |= {"final_obs": objects}
-                masked |= {"final_obs": reset}
+                info |= {"final_obs": objects, "final_info": last}
+                masked |= {"final_obs": reset, "final_info": reset}
         return info | {f"_{name}": mask for name, mask in masked.items()}
 
     def render(self) -> tuple[Any, ...] | None:
