@@ -1,7 +1,8 @@
 """The environments as other libraries want them.
 
 Importing this registers `mjx_arm/ArmCubeA-v0` and `mjx_arm/ArmCubeB-v0` with gymnasium. The
-adapters to gymnax are in `mjx_arm.interop.gymnax_env`, since they need it installed.
+adapters to gymnax are in `mjx_arm.interop.gymnax_env`, that to Stable-Baselines3's `VecEnv` in
+`mjx_arm.interop.sb3`, since they need those installed.
 """
 
 import gymnasium

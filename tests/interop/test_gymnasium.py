@@ -87,6 +87,9 @@ def test_a_vector_env_resets_as_gymnasium_says(autoreset):
     assert ended[3] == [True] * 3
     if autoreset == "same_step":
         assert info["_final_obs"].all()
+        assert info["_final_info"].all()
+        np.testing.assert_array_equal(info["final_info"]["distance"], info["distance"])
+        assert info["final_info"]["_distance"].all()
         # The arm has moved in the last observation, and is as at the start in the new one.
         last = np.stack(info["final_obs"])
         assert (np.abs(last - first).max(axis=-1) > 1e-3).all()
@@ -131,4 +134,29 @@ def test_stable_baselines3_takes_it_as_it_is():
     agent = DQN("CnnPolicy", envs, learning_starts=20, buffer_size=100, batch_size=4)
     agent.learn(60)
     assert agent.num_timesteps >= 60
+    assert agent._n_updates > 0
+
+
+@pytest.mark.peers
+def test_stable_baselines3_takes_many_in_one_call():
+    from stable_baselines3 import DQN
+
+    from mjx_arm.interop.sb3 import ArmCubeVecEnv
+
+    envs = ArmCubeVecEnv("A", 3, observation="state", **OPTIONS)
+    envs.seed(0)
+    first = envs.reset()
+    assert first.shape == (3, *envs.observation_space.shape)
+    steps = [envs.step(np.full(3, SHOULDER_UP)) for _ in range(4)]
+    assert [ended.tolist() for _, _, ended, _ in steps] == [[False] * 3] * 3 + [[True] * 3]
+    obs, _, _, infos = steps[-1]
+    np.testing.assert_allclose(obs, first, atol=1e-6)
+    assert all(info["TimeLimit.truncated"] and not info["success"] for info in infos)
+    # What an episode ended with is not what the next one begins with.
+    assert np.abs(infos[0]["terminal_observation"] - first[0]).max() > 1e-3
+    with pytest.raises(AttributeError, match="cannot be set"):
+        envs.set_attr("env", None)
+    images = ArmCubeVecEnv("A", 2, **OPTIONS | {"size": (36, 36)})
+    agent = DQN("CnnPolicy", images, learning_starts=20, buffer_size=100, batch_size=4)
+    agent.learn(60)
     assert agent._n_updates > 0

@@ -1,0 +1,245 @@
+"""How long Stable-Baselines3's DQN takes to lift the cube in environment A, beside our own runs.
+
+    .venv-peers/bin/python benchmarks/time_to_success.py runs/NAME --json FILE
+
+The time of ours is in the metrics of a run: that of the first selection in which 90 % of the
+held-out episodes succeeded. Stable-Baselines3 then trains for at most 5 times as long, once with
+the best of ours (our network, 64 of our environments in one call, our reward, exploration, 3-step
+returns and averaged target, which also is what is judged), once with its defaults on one of our
+environments, and is judged as often and in the same way.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import pathlib
+import time
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+from machine import machine
+from peers import TorchNetwork
+from stable_baselines3 import DQN
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from torch import nn
+
+from mjx_arm.agent import load_config
+from mjx_arm.config import RewardConfig, TrainConfig
+from mjx_arm.evaluate import wilson_interval
+from mjx_arm.interop.sb3 import ArmCubeVecEnv
+from mjx_arm.report.metrics import read_metrics
+
+_GOAL = 0.9
+_EPSILON = 0.1
+_SEED = 2_000_003
+
+
+def our_time(folder: pathlib.Path) -> dict[str, Any]:
+    """When a run of ours first had what is asked for; judged by its own selections."""
+    config = load_config(folder)
+    judged = [
+        {
+            "minutes": row["wall_s"] / 60,
+            "env_steps": row["env_steps"],
+            "rate": row["selection_rate"],
+        }
+        for row in read_metrics(folder)
+        if math.isfinite(row["selection_rate"])
+    ]
+    reached = next((row for row in judged if row["rate"] >= _GOAL), None)
+    return {
+        "learner": "mjx_arm",
+        "seed": config.seed,
+        "episodes": config.select_episodes,
+        "judged": judged,
+        "reached": reached,
+    }
+
+
+class Extractor(BaseFeaturesExtractor):
+    """Our convolutions and first dense layer."""
+
+    def __init__(self, space: gymnasium.spaces.Box, config: TrainConfig):
+        super().__init__(space, config.hidden)
+        self.body = TorchNetwork(config).body
+
+    def forward(self, images: torch.Tensor) -> torch.Tensor:
+        """Features `[B, hidden]` of images `[B, 3, H, W]` in 0 to 1."""
+        return self.body(images - 0.5)
+
+
+def best_of_ours(config: TrainConfig, total_steps: int) -> DQN:
+    """Stable-Baselines3's DQN with all of our settings that it has."""
+    envs = make_envs(config, config.num_envs)
+    return DQN(
+        "CnnPolicy",
+        envs,
+        learning_rate=config.learning_rate,
+        buffer_size=config.replay_size,
+        learning_starts=config.learning_starts,
+        batch_size=config.batch_size,
+        tau=config.polyak,
+        gamma=config.gamma,
+        train_freq=1,
+        gradient_steps=config.updates_per_step,
+        n_steps=config.n_step,
+        target_update_interval=1,
+        exploration_fraction=config.epsilon_steps / total_steps,
+        exploration_final_eps=config.epsilon_end,
+        max_grad_norm=config.max_grad_norm,
+        policy_kwargs={
+            "features_extractor_class": Extractor,
+            "features_extractor_kwargs": {"config": config},
+            "net_arch": [],
+        },
+        seed=config.seed,
+    )
+
+
+def defaults(config: TrainConfig, total_steps: int) -> DQN:
+    """Its defaults, on one of our environments with our reward."""
+    del total_steps
+    return DQN("CnnPolicy", make_envs(config, 1), buffer_size=100_000, seed=config.seed)
+
+
+LEARNERS: dict[str, tuple[Callable[[TrainConfig, int], DQN], bool]] = {
+    "sb3, best of ours": (best_of_ours, True),
+    "sb3, defaults": (defaults, False),
+}
+
+
+def make_envs(config: TrainConfig, num_envs: int, **changes: Any) -> ArmCubeVecEnv:
+    """Our environments with the reward and the length of episodes of a run."""
+    reward = RewardConfig(kind=config.reward, scale=config.reward_scale, discount=config.gamma)
+    options = {"reward": reward, "max_steps": config.max_steps} | changes
+    return ArmCubeVecEnv(config.env, num_envs, physics="native", **options)
+
+
+class Judge:
+    """Tries an agent: one episode in each of so many environments, all of them counted."""
+
+    def __init__(self, config: TrainConfig):
+        self._envs = make_envs(config, config.select_episodes, max_steps=1000)
+
+    def success_rate(self, network: nn.Module) -> float:
+        """Share of the episodes in which the cube was lifted, at epsilon 0.1."""
+        count, random = self._envs.num_envs, np.random.default_rng(_SEED)
+        self._envs.seed(_SEED)
+        obs, open_, successes = self._envs.reset(), np.ones(count, bool), 0
+        while open_.any():
+            with torch.inference_mode():
+                best = network(torch.as_tensor(obs.transpose(0, 3, 1, 2))).argmax(-1).numpy()
+            explore = random.random(count) < _EPSILON
+            action = np.where(explore, random.integers(14, size=count), best)
+            obs, _, ended, infos = self._envs.step(action)
+            successes += sum(bool(infos[i]["success"]) for i in np.flatnonzero(ended & open_))
+            open_ &= ~ended
+        return successes / count
+
+
+class Judging(BaseCallback):
+    """Judges every so many steps, and stops at the goal or when the time is over."""
+
+    def __init__(
+        self,
+        judge: Judge,
+        *,
+        every: int,
+        minutes: float,
+        averaged: bool,
+        report: Callable[[dict[str, Any]], None],
+    ):
+        super().__init__()
+        self._judge, self._every, self._minutes = judge, every, minutes
+        self._averaged, self._report = averaged, report
+        self._next, self._started = every, time.perf_counter()
+
+    def _on_step(self) -> bool:
+        if self.num_timesteps >= self._next:
+            self._next += self._every
+            policy = self.model.policy
+            network = policy.q_net_target if self._averaged else policy.q_net
+            network.set_training_mode(False)
+            rate = self._judge.success_rate(network)
+            self._report({"minutes": self._spent(), "env_steps": self.num_timesteps, "rate": rate})
+            if rate >= _GOAL:
+                return False
+        return self._spent() < self._minutes
+
+    def _spent(self) -> float:
+        return (time.perf_counter() - self._started) / 60
+
+
+def their_time(
+    name: str, config: TrainConfig, minutes: float, write: Callable[[dict[str, Any]], None]
+) -> None:
+    """Trains one of theirs, and reports after every judgement."""
+    make, averaged = LEARNERS[name]
+    result: dict[str, Any] = {
+        "learner": name,
+        "seed": config.seed,
+        "episodes": config.select_episodes,
+        "most_minutes": minutes,
+        "judged": [],
+        "reached": None,
+    }
+
+    def report(row: dict[str, Any]) -> None:
+        result["judged"].append(row)
+        result["reached"] = row if row["rate"] >= _GOAL else None
+        low, high = wilson_interval(
+            round(row["rate"] * config.select_episodes), config.select_episodes
+        )
+        print(
+            f"{name}: {row['minutes']:.1f} minutes, {row['env_steps']:,} steps, "
+            f"{100 * row['rate']:.0f} % ({100 * low:.0f} to {100 * high:.0f})",
+            flush=True,
+        )
+        write(result)
+
+    agent = make(config, config.total_steps)
+    judging = Judging(
+        Judge(config), every=config.select_every, minutes=minutes, averaged=averaged, report=report
+    )
+    agent.learn(config.total_steps, callback=judging, log_interval=10**9)
+    result["minutes"], result["env_steps"] = judging._spent(), agent.num_timesteps
+    write(result)
+
+
+def main() -> None:
+    """Reads our run, trains theirs, and writes the results as they come."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("run", type=pathlib.Path, help="a run folder of ours, in environment A")
+    parser.add_argument("--learners", nargs="+", choices=LEARNERS, default=list(LEARNERS))
+    parser.add_argument("--minutes", type=float, help="5 times ours where left out")
+    parser.add_argument("--threads", type=int, help="of PyTorch; all cores where left out")
+    parser.add_argument("--json", type=pathlib.Path, help="file for the results")
+    options = parser.parse_args()
+    if options.threads:
+        torch.set_num_threads(options.threads)
+    ours = our_time(options.run)
+    if options.minutes is None and ours["reached"] is None:
+        parser.error(f"{options.run} never reached {_GOAL:.0%}: give --minutes")
+    minutes = options.minutes or 5 * ours["reached"]["minutes"]
+    results = {"mjx_arm": ours}
+
+    def write(result: dict[str, Any]) -> None:
+        results[result["learner"]] = result
+        if options.json:
+            about = machine() | {"torch": torch.__version__, "threads": torch.get_num_threads()}
+            report = {"machine": about, "goal": _GOAL, "results": list(results.values())}
+            options.json.write_text(json.dumps(report, indent=1) + "\n")
+
+    print(f"mjx_arm: {_GOAL:.0%} after {ours['reached'] and ours['reached']['minutes']} minutes")
+    for name in options.learners:
+        their_time(name, load_config(options.run), minutes, write)
+
+
+if __name__ == "__main__":
+    main()
