@@ -5,6 +5,8 @@ epsilon 0.1 with a seed that neither training nor selection has seen, 100 episod
 Newcombe's 95 % interval of the difference.
 
     python benchmarks/success.py runs/NAME [runs/NAME ...] --json benchmarks/results/success_A.json
+
+Rows that the file has of other environments and seeds stay, each with the machine it is from.
 """
 
 from __future__ import annotations
@@ -51,8 +53,17 @@ def report(folder: pathlib.Path, episodes: int, mjx_episodes: int) -> dict[str, 
         "newcombe_ci95": newcombe_interval(
             native.successes, native.episodes, mjx.successes, mjx.episodes
         ),
+        "machine": machine(),
         "config": dataclasses.asdict(agent.config),
     }
+
+
+def write_row(path: pathlib.Path, row: dict[str, Any]) -> None:
+    """Writes a row into a file of rows, in the place of one of the same environment and seed."""
+    rows = json.loads(path.read_text())["rows"] if path.is_file() else []
+    kept = [other for other in rows if (other["env"], other["seed"]) != (row["env"], row["seed"])]
+    kept = sorted([*kept, row], key=lambda row: (row["env"], row["seed"]))
+    path.write_text(json.dumps({"rows": kept}, indent=1) + "\n")
 
 
 def main() -> None:
@@ -63,13 +74,11 @@ def main() -> None:
     parser.add_argument("--mjx-episodes", type=int, default=100)
     parser.add_argument("--json", type=pathlib.Path, help="file to write the results to")
     arguments = parser.parse_args()
-    rows = []
     for folder in arguments.runs:
-        rows.append(report(folder, arguments.episodes, arguments.mjx_episodes))
-        print(json.dumps({k: v for k, v in rows[-1].items() if k != "config"}))
+        row = report(folder, arguments.episodes, arguments.mjx_episodes)
+        print(json.dumps({k: v for k, v in row.items() if k != "config"}))
         if arguments.json:
-            text = json.dumps({"machine": machine(), "rows": rows}, indent=1)
-            arguments.json.write_text(text + "\n")
+            write_row(arguments.json, row)
 
 
 if __name__ == "__main__":

@@ -17,6 +17,7 @@ import concurrent.futures
 import ctypes
 import dataclasses
 import gc
+import importlib.util
 import itertools
 import json
 import multiprocessing
@@ -40,7 +41,10 @@ from mjx_arm.memory import memory_plan, working_memory
 from mjx_arm.parts import in_parts, overwrite_in_parts
 from mjx_arm.physics import compiler_options
 
-STAGES = ("physics", "render", "physics+render", "act", "learn", "train")
+_ENV_STAGES = ("physics", "render", "physics+render")
+STAGES = (*_ENV_STAGES, "act", "learn", "train")
+# What the other stages add up to.
+_SUMS = ("physics+render", "train")
 NUM_ENVS = (16, 64, 256, 1024, 4096, 16384)
 # Updates of one timed chunk, at least.
 _UPDATES = 8
@@ -221,15 +225,21 @@ def _learn_calls(config: mjx_arm.TrainConfig) -> int:
 
 
 def rows(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
-    """Measures; a row a figure."""
+    """Measures; a row a figure, on a GPU those first that sum up the others."""
     repeats = 3 if options.quick or options.gpu else 7
-    cases = itertools.product(options.shadows, options.sizes, options.num_envs, options.physics)
-    for shadows, size, num_envs, physics in cases:
+    first = [stage for stage in _SUMS if stage in options.stages] if options.gpu else []
+    rest = [stage for stage in options.stages if stage not in first]
+    cases = [options.shadows, options.sizes, options.num_envs, options.physics]
+    for stages, (shadows, size, num_envs, physics) in itertools.product(
+        (first, rest), itertools.product(*cases)
+    ):
+        some = argparse.Namespace(**vars(options) | {"stages": stages})
         length = max(2 if options.quick else 4, options.work // num_envs)
         common = {"size": size, "shadows": shadows, "num_envs": num_envs}
-        yield from env_rows(options, physics, common, length, repeats)
-        if not shadows:
-            yield from agent_rows(options, physics, common, length, repeats)
+        if set(stages) & set(_ENV_STAGES):
+            yield from env_rows(some, physics, common, length, repeats)
+        if not shadows and set(stages) - set(_ENV_STAGES):
+            yield from agent_rows(some, physics, common, length, repeats)
 
 
 def env_rows(
@@ -371,8 +381,8 @@ def parse() -> argparse.Namespace:
     if options.gpu:
         if jax.default_backend() != "gpu":
             parser.error(f"--gpu needs an NVIDIA GPU, and jax runs on {jax.default_backend()}")
-        options.num_envs = options.num_envs or [1024, 8192]
-        options.physics = options.physics or ["mjx", "mjx-warp"]
+        options.num_envs = options.num_envs or [8192, 1024]
+        options.physics = options.physics or _gpu_backends()
         options.minutes = options.minutes or 9.0
         options.work = max(options.work, 131_072)
         options.batch_size = options.batch_size or 1024
@@ -382,6 +392,13 @@ def parse() -> argparse.Namespace:
     options.storages = options.storages or (["states"] if few else ["states", "pixels"])
     options.shadows = [bool(x) for x in options.shadows or ([0] if few else [0, 1])]
     return options
+
+
+def _gpu_backends() -> list[str]:
+    if importlib.util.find_spec("warp"):
+        return ["mjx", "mjx-warp"]
+    print("mjx-warp is left out: its extra is not installed, pip install 'mjx-arm[warp]'")
+    return ["mjx"]
 
 
 def main() -> None:
