@@ -57,8 +57,10 @@ class Agent:
 
 
 def save_config(folder: pathlib.Path, config: TrainConfig) -> None:
-    """Writes `config.json`."""
-    (folder / _CONFIG).write_text(_dump_config(config) + "\n")
+    """Writes `config.json`: whole, or the one before stays."""
+    part = folder / f"{_CONFIG}.part"
+    part.write_text(_dump_config(config) + "\n")
+    part.replace(folder / _CONFIG)
 
 
 def load_config(folder: pathlib.Path) -> TrainConfig:
@@ -83,12 +85,14 @@ def save_agent(
 ) -> None:
     """Writes an agent to one file: whole, or not at all.
 
+    Of the configuration all but the backend of the physics, which is for who tries it to choose.
+
     Raises:
       ValueError: the disk is full, or the folder cannot be written.
     """
     content = {
         "format": _FORMAT,
-        "config": _dump_config(config),
+        "config": _dump_config(dataclasses.replace(config, physics="auto")),
         "env_steps": env_steps,
         "selection_rate": selection_rate,
         "params": flax.serialization.to_state_dict(jax.device_get(params)),

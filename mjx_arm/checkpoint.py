@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import pathlib
 import shutil
+import zlib
 from typing import Any
 
 import jax
@@ -26,7 +27,7 @@ def save_tree(path: pathlib.Path, tree: Any) -> None:
     try:
         with ocp.StandardCheckpointer() as checkpointer:
             checkpointer.save(path.absolute(), _to_data(tree), force=True)
-        manifest = {"files": _file_sizes(path), "arrays": _describe(tree)}
+        manifest = {"files": _checksums(path), "arrays": _describe(tree)}
         part = path / f"{_MANIFEST}.part"
         part.write_text(json.dumps(manifest))
         part.replace(path / _MANIFEST)
@@ -46,23 +47,31 @@ def load_tree(path: pathlib.Path, like: Any) -> Any:
     # Checked beforehand: a read that fails half-way leaves orbax with coroutines to complain of.
     if not (path / _MANIFEST).is_file():
         raise ValueError(f"{path} is not a checkpoint, or not a whole one")
-    try:
-        manifest = json.loads((path / _MANIFEST).read_text())
-    except json.JSONDecodeError:
-        manifest = {"files": None}
-    if manifest["files"] != _file_sizes(path):
+    files, arrays = _read_manifest(path)
+    if files != _checksums(path):
         raise ValueError(f"{path} is damaged: its files are not those that were written")
-    if manifest["arrays"] != _describe(like):
+    if arrays != _describe(like):
         raise ValueError(f"{path} is not a checkpoint of such a run")
     with ocp.StandardCheckpointer() as checkpointer:
         return _from_data(checkpointer.restore(path.absolute(), _to_data(like)), like)
 
 
-def _file_sizes(path: pathlib.Path) -> dict[str, int]:
-    """Bytes of each file of a checkpoint, but for the manifest."""
+def _read_manifest(path: pathlib.Path) -> tuple[Any, Any]:
+    """The checksums of a checkpoint's files and its arrays, None where the manifest has none."""
+    try:
+        manifest = json.loads((path / _MANIFEST).read_text())
+    except (json.JSONDecodeError, UnicodeDecodeError):
+        manifest = None
+    if not isinstance(manifest, dict):
+        return None, None
+    return manifest.get("files"), manifest.get("arrays")
+
+
+def _checksums(path: pathlib.Path) -> dict[str, int]:
+    """CRC-32 of each file of a checkpoint, but for the manifest."""
     files = (file for file in path.rglob("*") if file.is_file())
     return {
-        str(file.relative_to(path)): file.stat().st_size
+        str(file.relative_to(path)): zlib.crc32(file.read_bytes())
         for file in files
         if not file.name.startswith(_MANIFEST)
     }
@@ -78,35 +87,35 @@ class RunCheckpoints:
     """The checkpoints of a run folder, by the number of vector steps that they were taken after."""
 
     def __init__(self, folder: pathlib.Path):
-        self._folder = folder / "checkpoints"
+        self.folder = folder / "checkpoints"
 
     def save(self, vector_step: int, state: Any) -> None:
         """Writes a checkpoint, then removes all but the last two.
 
         Raises:
-          ValueError: it could not be written; names the newest whole one, if there is one.
+          ValueError: it could not be written.
         """
-        path = self._folder / f"{vector_step:0{_DIGITS}d}"
+        path = self.folder / f"{vector_step:0{_DIGITS}d}"
         try:
             save_tree(path, state)
-        except ValueError as error:
+        except ValueError:
             shutil.rmtree(path, ignore_errors=True)
-            steps = self.steps()
-            if not steps:
-                raise
-            raise ValueError(
-                f"{error}; --resume goes on from {steps[-1]:0{_DIGITS}d}, which is whole"
-            ) from error
+            raise
         for step in self.steps()[:-_KEPT]:
-            shutil.rmtree(self._folder / f"{step:0{_DIGITS}d}")
+            shutil.rmtree(self.folder / f"{step:0{_DIGITS}d}")
 
     def steps(self) -> list[int]:
         """Vector steps of the checkpoints there are, the oldest first."""
-        if not self._folder.is_dir():
+        if not self.folder.is_dir():
             return []
-        whole = (path for path in self._folder.iterdir() if (path / _MANIFEST).is_file())
+        whole = (path for path in self.folder.iterdir() if (path / _MANIFEST).is_file())
         names = (path.name for path in whole)
         return sorted(int(name) for name in names if len(name) == _DIGITS and name.isdigit())
+
+    def newest(self) -> str | None:
+        """Name of the newest whole checkpoint, if there is one."""
+        steps = self.steps()
+        return f"{steps[-1]:0{_DIGITS}d}" if steps else None
 
     def load_newest(self, like: Any) -> tuple[Any, int]:
         """Reads the newest checkpoint.
@@ -116,7 +125,7 @@ class RunCheckpoints:
         """
         steps = self.steps()
         if not steps:
-            raise ValueError(f"{self._folder} holds no checkpoint to go on from")
+            raise ValueError(f"{self.folder} holds no checkpoint to go on from")
         try:
             return self.load(steps[-1], like), steps[-1]
         except ValueError as error:
@@ -136,7 +145,7 @@ class RunCheckpoints:
         Raises:
           ValueError: it is damaged, or of another run.
         """
-        return load_tree(self._folder / f"{step:0{_DIGITS}d}", like)
+        return load_tree(self.folder / f"{step:0{_DIGITS}d}", like)
 
 
 def _is_key(leaf: Any) -> bool:

@@ -21,7 +21,7 @@ from mjx_arm.agent import Agent, load_agent, load_config
 from mjx_arm.config import PRESETS, EnvConfig, TrainConfig
 from mjx_arm.evaluate import evaluate
 from mjx_arm.report.figures import plot_curves
-from mjx_arm.report.video import draw_episode, record_episode, write_video
+from mjx_arm.report.video import check_video_path, draw_episode, record_episode, write_video
 from mjx_arm.train import RunInterruptedError, resume, seed_folders, train
 
 
@@ -59,7 +59,8 @@ class Train:
         saved = load_config(folder)
         changed = given - {"resume", "total_steps", "eval_episodes"}
         for name in sorted(changed):
-            if getattr(self.config, name, None) != getattr(saved, name, folder):
+            value = getattr(self.config, name, None)
+            if value != getattr(saved, name, folder) and (name, value) != ("physics", "auto"):
                 option = name.replace("_", "-")
                 raise ValueError(f"--{option} cannot change when a run goes on; leave it out")
         resume(
@@ -77,7 +78,7 @@ class _Try:
     Attributes:
       agent: an agent's file, or a run folder, of which the best agent is taken.
       env: environment, `A` or `B`; by default the one it was trained in.
-      physics: backend; by default that of the run.
+      physics: backend; by default native on CPU and mjx elsewhere.
       epsilon: share of random actions.
       seed: of starts and random actions.
       max_steps: iterations until an episode is truncated.
@@ -141,6 +142,7 @@ class Play(_Try):
     def run(self, given: frozenset[str]) -> None:
         """Runs the command."""
         del given
+        check_video_path(self.out)
         agent = self.load()
         episode = record_episode(
             agent.env, agent.dqn.apply, agent.params, epsilon=self.epsilon, seed=self.seed
@@ -223,5 +225,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 2
     except RunInterruptedError as stop:
         print(stop, file=sys.stderr)
+        return 130
+    except KeyboardInterrupt:
+        print("stopped", file=sys.stderr)
         return 130
     return 0

@@ -257,6 +257,19 @@ class TrainConfig:
         for name in _COUNTS:
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} is {getattr(self, name)}: give at least 1")
+        if not 0 <= self.seed <= _MOST_SEED - self.num_seeds:
+            raise ValueError(f"seed is {self.seed}: give 0 to {_MOST_SEED - self.num_seeds}")
+        if self.total_steps > _MOST_STEPS:
+            raise ValueError(f"total_steps is {self.total_steps}: give at most {_MOST_STEPS}")
+        for name in ("widths", "kernels", "strides", "size"):
+            if min(getattr(self, name)) < 1:
+                raise ValueError(
+                    f"{name} is {getattr(self, name)}: give whole numbers, each at least 1"
+                )
+        if self.observation == "packed" and self._smallest_edge() < 1:
+            raise ValueError(
+                f"size is {self.size}: strides and pooling leave nothing of it, give more pixels"
+            )
         if self.select_every < 0:
             raise ValueError(f"select_every is {self.select_every}: give 0 or more")
         for name in ("learning_rate", "reward_scale"):
@@ -268,8 +281,8 @@ class TrainConfig:
             raise ValueError(f"epsilon_spread is {self.epsilon_spread}: give at least 1")
         if self.replay_slots <= self.n_step:
             raise ValueError(
-                f"replay_size is {self.replay_size}: give more than n_step * num_envs = "
-                f"{self.n_step * self.num_envs}"
+                f"replay_size is {self.replay_size}: give at least (n_step + 1) * num_envs = "
+                f"{(self.n_step + 1) * self.num_envs}"
             )
         if self.replay_slots > _MOST_SLOTS:
             raise ValueError(
@@ -279,6 +292,15 @@ class TrainConfig:
             raise ValueError(
                 f"replay_size is {self.replay_size}: give at least batch_size = {self.batch_size}"
             )
+
+    def _smallest_edge(self) -> int:
+        """Of what the last convolution gives, pixels."""
+        edge = min(self.size)
+        for layer, stride in enumerate(self.strides):
+            edge = -(-edge // stride)
+            # No pooling after the last one.
+            edge = edge // self.pool if layer < len(self.strides) - 1 else edge
+        return edge
 
     @property
     def replay_slots(self) -> int:
@@ -309,8 +331,10 @@ class TrainConfig:
         )
 
 
-# Slots are counted in 32 bits.
+# Slots, steps and seeds are 32 bits wide; steps with room for a last chunk.
 _MOST_SLOTS = 2**30
+_MOST_STEPS = 2_000_000_000
+_MOST_SEED = 2**31
 
 _COUNTS = (
     "num_seeds",

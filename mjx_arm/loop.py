@@ -175,7 +175,9 @@ def epsilon_at(config: TrainConfig, env_steps: jax.Array) -> jax.Array:
 
 def spread_epsilon(config: TrainConfig, epsilon: jax.Array) -> jax.Array:
     """The share of each environment, `[N] float32`; see `TrainConfig.epsilon_spread`."""
-    ratios = np.geomspace(1 / config.epsilon_spread, config.epsilon_spread, config.num_envs)
+    # The middle of the ratios, where there is but one environment.
+    spread = config.epsilon_spread if config.num_envs > 1 else 1.0
+    ratios = np.geomspace(1 / spread, spread, config.num_envs)
     return jnp.minimum(epsilon * jnp.asarray(ratios, jnp.float32), 1.0)
 
 

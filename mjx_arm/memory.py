@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import pathlib
 from typing import Any
 
 import jax
@@ -44,12 +45,21 @@ def free_memory() -> int | None:
     """Bytes free on the default device, or on CPU in the machine; None where nobody says."""
     device = jax.devices()[0]
     if device.platform == "cpu":
-        try:
-            return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_AVPHYS_PAGES")
-        except (ValueError, OSError):
-            return None
+        return _free_of_machine()
     stats = device.memory_stats()
     return stats["bytes_limit"] - stats["bytes_in_use"] if stats else None
+
+
+def _free_of_machine() -> int | None:
+    """Bytes that Linux could give without swapping; elsewhere all that there are."""
+    meminfo = pathlib.Path("/proc/meminfo")
+    if meminfo.is_file():
+        lines = meminfo.read_text().splitlines()
+        return next(int(x.split()[1]) * 1024 for x in lines if x.startswith("MemAvailable"))
+    try:
+        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    except (ValueError, OSError):
+        return None
 
 
 def tree_size(tree: Any) -> int:

@@ -6,10 +6,13 @@ import contextlib
 import dataclasses
 import json
 import math
+import os
 import pathlib
+import shlex
 import signal
+import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from types import FrameType, TracebackType
 from typing import Any, Self
 
@@ -33,7 +36,7 @@ from mjx_arm.evaluate import Evaluation, evaluate, make_evaluator
 from mjx_arm.loop import Counts, LoopState, Trainer, make_trainer, run_keys, summarise
 from mjx_arm.memory import check_memory, memory_plan, working_memory
 from mjx_arm.report.figures import plot_curves
-from mjx_arm.report.metrics import MetricsWriter, keep_metrics, last_wall_s
+from mjx_arm.report.metrics import MetricsWriter, keep_metrics, last_env_steps, last_wall_s
 from mjx_arm.report.progress import (
     describe,
     make_progress,
@@ -78,9 +81,12 @@ def train(
       ValueError: the options do not fit the machine, or the folder cannot be used.
       RunInterruptedError: Ctrl-C.
     """
+    _check_episodes(eval_episodes)
     trainer = _prepare(config, console)
     prepare_folder(folder)
     run_chunk = _compile(trainer, console)
+    # With the backend by name: where a run goes on, "auto" may mean another, with other states.
+    config = dataclasses.replace(config, physics=trainer.env.physics.backend)
     _save_configs(folder, config)
     _run(trainer, run_chunk, trainer.init(run_keys(config)), 0, folder, console)
     return _finish(folder, config, eval_episodes, console)
@@ -100,7 +106,8 @@ def resume(
 
     Args:
       folder: the run folder.
-      total_steps: train for this long in all; by default as long as was planned.
+      total_steps: train for this long in all, longer than until now; by default as long as was
+        planned. The selection that ended a shorter run is kept.
       eval_episodes: episodes of the evaluation at the end.
       console: where it speaks.
 
@@ -108,19 +115,45 @@ def resume(
       ValueError: the folder holds no run that can go on.
       RunInterruptedError: Ctrl-C.
     """
-    config = load_config(folder)
+    _check_episodes(eval_episodes)
+    saved = config = load_config(folder)
     if total_steps is not None:
         config = dataclasses.replace(config, total_steps=total_steps)
     trainer = _prepare(config, console)
     # Before the state is held, or its memory would count as needed and as taken.
     run_chunk = _compile(trainer, console)
-    state, vector_step = RunCheckpoints(folder).load_newest(_shapes(trainer))
-    _save_configs(folder, config)
+    state, vector_step = _load_state(trainer, folder)
+    if config.total_steps < min(vector_step * config.num_envs, saved.total_steps):
+        raise ValueError(
+            f"--total-steps is {total_steps}: the run has made "
+            f"{vector_step * config.num_envs} already, give more"
+        )
+    if config != saved:
+        _save_configs(folder, config)
     for seed_folder in seed_folders(folder, config):
         keep_metrics(seed_folder, vector_step * config.num_envs)
     console.print(f"going on after {vector_step * config.num_envs:,} steps")
     _run(trainer, run_chunk, state, vector_step // config.chunk_length, folder, console)
     return _finish(folder, config, eval_episodes, console)
+
+
+def _check_episodes(eval_episodes: int) -> None:
+    if eval_episodes < 1:
+        raise ValueError(f"eval_episodes is {eval_episodes}: give at least 1")
+
+
+def _load_state(trainer: Trainer, folder: pathlib.Path) -> tuple[LoopState, int]:
+    """The state to go on from and its vector step: the start of a run that has not saved one yet.
+
+    Raises:
+      ValueError: there is none, or it is damaged.
+    """
+    config, checkpoints = trainer.config, RunCheckpoints(folder)
+    own = seed_folders(folder, config)[0]
+    unsaved = _SAVE_EVERY * config.chunk_length * config.num_envs
+    if checkpoints.newest() is None and last_env_steps(own) <= unsaved:
+        return trainer.init(run_keys(config)), 0
+    return checkpoints.load_newest(_shapes(trainer))
 
 
 def _prepare(config: TrainConfig, console: Console) -> Trainer:
@@ -236,6 +269,7 @@ def _run(
         epsilon=_EVALUATION_EPSILON,
     )
     with contextlib.ExitStack() as stack:
+        stack.enter_context(_offering(checkpoints))
         interruption = stack.enter_context(_Interruption())
         progress = stack.enter_context(make_progress(console))
         pairs = zip(seed_folders(folder, config), _seed_configs(config), strict=True)
@@ -260,11 +294,27 @@ def _run(
             ]
             progress.update(task, completed=chunk * per_chunk, metrics=describe(rows))
             if last or chunk % _SAVE_EVERY == 0 or interruption.asked:
-                checkpoints.save(chunk * config.chunk_length, state)
+                # The checkpoint last: what is older than it would not be made again.
                 for result, own in zip(results, params, strict=True):
                     result.save_last(own, chunk * per_chunk)
+                checkpoints.save(chunk * config.chunk_length, state)
             if interruption.asked and not last:
-                raise RunInterruptedError(f"saved; go on with: python train.py --resume {folder}")
+                command = f"{sys.executable} -m mjx_arm train --resume {shlex.quote(str(folder))}"
+                raise RunInterruptedError(f"saved; go on with: {command}")
+
+
+@contextlib.contextmanager
+def _offering(checkpoints: RunCheckpoints) -> Iterator[None]:
+    """Adds to what could not be written the checkpoint to go on from, in one sentence."""
+    try:
+        yield
+    except (OSError, ValueError) as error:
+        said = str(error)
+        if isinstance(error, OSError):
+            said = f"{error.filename or checkpoints.folder}: {error.strerror or error}"
+        newest = checkpoints.newest()
+        offer = f"; --resume goes on from {newest}, which is whole" if newest else ""
+        raise ValueError(f"{said}{offer}") from error
 
 
 def _is_due(config: TrainConfig, chunk: int) -> bool:
@@ -351,7 +401,11 @@ def prepare_folder(folder: pathlib.Path) -> None:
         occupied = any(folder.iterdir())
     except (FileExistsError, NotADirectoryError) as error:
         raise ValueError(f"{folder} is a file: give --out a new or empty folder") from error
-    except PermissionError as error:
-        raise ValueError(f"{folder} cannot be written: give --out another folder") from error
+    except OSError as error:
+        raise ValueError(
+            f"{folder} cannot be made ({error.strerror}): give --out another folder"
+        ) from error
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise ValueError(f"{folder} cannot be written: give --out another folder")
     if occupied:
         raise ValueError(f"{folder} is not empty: give --out a new or empty folder")

@@ -11,8 +11,9 @@ import imageio_ffmpeg
 import jax
 import numpy as np
 import pytest
+from tensorboardX.proto.event_pb2 import Event
 
-from mjx_arm.agent import load_agent, load_config
+from mjx_arm.agent import load_agent, load_config, save_config
 from mjx_arm.cli import main
 from mjx_arm.config import PRESETS, TrainConfig
 from mjx_arm.report.metrics import read_metrics
@@ -43,7 +44,8 @@ def test_a_run_leaves_everything(run_folder):
     rows = read_metrics(run_folder)
     assert [row["env_steps"] for row in rows] == [200, 400]
     assert json.loads((run_folder / "evaluation.json").read_text())["episodes"] == 6
-    assert load_config(run_folder).total_steps == 400
+    config = load_config(run_folder)
+    assert (config.total_steps, config.physics) == (400, "native")
 
 
 def read_video(path: pathlib.Path) -> np.ndarray:
@@ -52,6 +54,20 @@ def read_video(path: pathlib.Path) -> np.ndarray:
     raw = [*decode, "-f", "rawvideo", "-pix_fmt", "rgb24", "-"]
     frames = subprocess.run(raw, capture_output=True, check=True).stdout
     return np.frombuffer(frames, np.uint8).reshape(-1, 384, 768, 3)
+
+
+def test_tensorboard_reads_the_events(run_folder):
+    (path,) = (run_folder / "tensorboard").iterdir()
+    content, events = path.read_bytes(), []
+    while content:
+        # A record: its length in 8 bytes, 4 of checksum, itself, 4 of checksum.
+        length = int.from_bytes(content[:8], "little")
+        events.append(Event.FromString(content[12 : 12 + length]))
+        content = content[16 + length :]
+    values = {(event.step, v.tag): v.simple_value for event in events for v in event.summary.value}
+    for row in read_metrics(run_folder):
+        for name in ("loss", "epsilon", "steps_per_s"):
+            assert values[row["env_steps"], name] == pytest.approx(row[name], rel=1e-6)
 
 
 def test_the_video_shows_the_scene_and_the_agents_view(run_folder):
@@ -84,6 +100,7 @@ def test_the_agent_acts(run_folder):
         (["--num-envs", "-3"], "num_envs is -3"),
         (["--batch-size", "0"], "batch_size is 0"),
         (["--replay-size", "32"], "replay_size is 32"),
+        (["--num-envs", "1", "--replay-size", "32"], "give at least batch_size = 64"),
         (["--replay-size", "100000000", "--storage", "pixels"], "give a smaller --replay-size"),
         (["--replay-size", "1000000000000"], "replay_size is 1000000000000"),
         (["--reward", "candy"], "unknown reward 'candy'"),
@@ -95,6 +112,13 @@ def test_the_agent_acts(run_folder):
         (["--num-envs", "many"], "--num-envs: invalid literal for int()"),
         (["--num-seeds", "0"], "num_seeds is 0"),
         (["--select-every", "-1"], "select_every is -1"),
+        (["--eval-episodes", "0"], "eval_episodes is 0"),
+        (["--seed", "-1"], "seed is -1"),
+        (["--seed", "2147483647", "--num-seeds", "2"], "seed is 2147483647"),
+        (["--total-steps", "3000000000"], "total_steps is 3000000000"),
+        (["--strides", "0", "1", "1"], "strides is (0, 1, 1)"),
+        (["--widths", "16", "0", "32"], "widths is (16, 0, 32)"),
+        (["--size", "4", "4"], "strides and pooling leave nothing of it"),
     ],
 )
 def test_bad_input_gets_one_sentence_and_status_2(arguments, message, capsys, tmp_path):
@@ -130,9 +154,14 @@ def test_an_output_folder_that_cannot_be_one_is_refused(capsys, tmp_path):
     full = tmp_path / "full"
     full.mkdir()
     (full / "thesis.tex").write_text("")
-    for folder, message in ((file, "is a file"), (full, "is not empty")):
+    # Where nobody can make a folder, not even root.
+    nowhere = pathlib.Path("/proc/self/mjx_arm")
+    refused = [(file, "is a file"), (full, "is not empty"), (nowhere, "cannot be made")]
+    for folder, message in refused[: 3 if sys.platform == "linux" else 2]:
         assert main(["train", *TINY, "--out", str(folder)]) == 2
-        assert message in capsys.readouterr().err
+        error = capsys.readouterr().err
+        assert message in error
+        assert error.count("\n") == 1
     assert [path.name for path in full.iterdir()] == ["thesis.tex"]
 
 
@@ -167,6 +196,28 @@ def test_play_writes_a_gif(run_folder, tmp_path, capsys):
     assert main(["play", str(run_folder), "--out", str(path), "--max-steps", "25"]) == 0
     assert imageio.imread(path, index=0).shape == (384, 768, 3)
     assert "26 frames, success: False" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [("video.avi", "ends in '.avi'"), ("nowhere/video.mp4", "a folder that exists")],
+)
+def test_a_video_that_could_not_be_written_is_refused_first(
+    name, message, run_folder, tmp_path, capsys
+):
+    assert main(["play", str(run_folder), "--out", str(tmp_path / name)]) == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_figures_of_a_run_without_metrics_are_refused(tmp_path, capsys):
+    save_config(tmp_path, TrainConfig())
+    # A process that was killed has left half a line.
+    (tmp_path / "metrics.jsonl").write_text('{"env_steps": 20')
+    assert main(["figures", str(tmp_path)]) == 2
+    assert "holds no metrics yet" in capsys.readouterr().err
 
 
 def test_figures_draws_the_curves_again(run_folder, capsys):

@@ -8,8 +8,17 @@ import numpy as np
 import pytest
 
 import mjx_arm
-from mjx_arm.config import TrainConfig
-from mjx_arm.loop import epsilon_at, make_train, make_trainer, run_keys, spread_epsilon, summarise
+from mjx_arm.config import PRESETS, TrainConfig
+from mjx_arm.loop import (
+    epsilon_at,
+    make_body,
+    make_train,
+    make_trainer,
+    run_keys,
+    spread_epsilon,
+    summarise,
+)
+from mjx_arm.replay import sample
 
 CONFIG = TrainConfig(
     physics="native",
@@ -95,23 +104,43 @@ def test_replay_holds_each_frame_once_and_voids_only_resets(run):
     assert void.sum() > 0
 
 
-def test_stored_states_are_drawn_as_they_were_seen():
-    pixels = train(dataclasses.replace(CONFIG, storage="pixels"), chunks=1)[1]
-    trainer, states, _ = train(CONFIG, chunks=1)
-    from mjx_arm.kinematics import make_kinematics
-
-    poses = make_kinematics(trainer.env.scene.mj_model)
-    held = 6  # before the first update the two runs do the same
-    drawn = jax.jit(jax.vmap(jax.vmap(lambda q: trainer.env.draw(poses(q)))))(
-        states.replay.steps.frame[:held]
-    )
-    seen = np.asarray(pixels.replay.steps.frame[:held])
+def test_both_storages_give_the_same_batches():
+    # Without an update the two runs do the same.
+    config = dataclasses.replace(CONFIG, learning_starts=400, n_step=3)
+    batches, images = [], []
+    for storage in ("states", "pixels"):
+        stored = dataclasses.replace(config, storage=storage)
+        replay = train(stored, chunks=3)[1].replay
+        batch = sample(replay, jax.random.key(0), 64, config.n_step, config.gamma)
+        restore = jax.jit(make_body(stored).storage.restore)
+        batches.append(batch.replace(frame=None, next_frame=None))
+        images.append(np.stack([restore(batch.frame), restore(batch.next_frame)]))
+    for a, b in zip(*map(jax.tree.leaves, batches), strict=True):
+        np.testing.assert_array_equal(a, b)
+    assert 0 < batches[0].weight.sum() < 64
     # Poses by C and by our kinematics differ in the last bit, which may tip a pixel on an edge, or
     # a colour to the next of its 255 levels.
-    same_geom = mjx_arm.segmentation(drawn) == mjx_arm.segmentation(seen)
-    assert np.mean(np.asarray(same_geom)) > 1 - 2e-3
-    colours = [np.asarray(mjx_arm.rgb(x), int)[np.asarray(same_geom)] for x in (drawn, seen)]
+    same_geom = np.asarray(mjx_arm.segmentation(images[0]) == mjx_arm.segmentation(images[1]))
+    assert np.mean(same_geom) > 1 - 2e-3
+    colours = [np.asarray(mjx_arm.rgb(x), int)[same_geom] for x in images]
     assert np.abs(colours[0] - colours[1]).max() <= 1
+
+
+def test_the_options_of_the_paper_train():
+    paper = dataclasses.asdict(PRESETS["paper"])
+    sizes = {field.name: getattr(CONFIG, field.name) for field in dataclasses.fields(CONFIG)}
+    small = ("physics", "num_envs", "size", "replay_size", "batch_size", "learning_starts")
+    small += ("chunk_steps", "widths", "hidden")
+    config = TrainConfig(**paper | {name: sizes[name] for name in small})
+    config = dataclasses.replace(config, updates_per_step=2, target_period=7, learning_rate=1e-3)
+    assert (config.huber, config.double, config.polyak) == (False, False, 0.0)
+    _, state, rows = train(config, chunks=2)
+    assert rows[-1]["updates"] == 2 * config.chunk_length
+    assert int(state.learner.updates) % config.target_period != 0
+    assert np.isfinite(rows[-1]["loss"])
+    # Copies are some updates old.
+    pairs = map(jax.tree.leaves, (state.learner.params, state.learner.target_params))
+    assert all((np.asarray(a) != np.asarray(b)).any() for a, b in zip(*pairs, strict=True))
 
 
 @pytest.mark.parametrize(("steps", "expected"), [(0, 1.0), (50_000, 0.55), (100_000, 0.1)])
@@ -127,6 +156,8 @@ def test_environments_explore_in_equal_ratios_around_epsilon():
     assert spread_epsilon(config, jnp.float32(0.6)).max() == 1.0
     alike = dataclasses.replace(config, epsilon_spread=1.0)
     np.testing.assert_allclose(spread_epsilon(alike, jnp.float32(0.1)), 0.1, rtol=1e-6)
+    alone = dataclasses.replace(config, num_envs=1)
+    np.testing.assert_allclose(spread_epsilon(alone, jnp.float32(0.1)), [0.1], rtol=1e-6)
 
 
 def test_state_features_train_too():

@@ -5,10 +5,13 @@ from __future__ import annotations
 import json
 import math
 import pathlib
+import time
 from types import TracebackType
 from typing import Self
 
-from tensorboardX import SummaryWriter
+from tensorboardX.event_file_writer import EventsWriter
+from tensorboardX.proto.event_pb2 import Event
+from tensorboardX.summary import scalar
 
 
 class MetricsWriter:
@@ -16,7 +19,10 @@ class MetricsWriter:
 
     def __init__(self, folder: pathlib.Path):
         self._file = (folder / "metrics.jsonl").open("a", buffering=1)
-        self._events = SummaryWriter(str(folder / "tensorboard"))
+        (folder / "tensorboard").mkdir(exist_ok=True)
+        # Not tensorboardX's SummaryWriter: on a full disk its thread dies, and who writes waits for
+        # it for ever.
+        self._events = EventsWriter(str(folder / "tensorboard" / "events"))
 
     def __enter__(self) -> Self:
         return self
@@ -36,7 +42,13 @@ class MetricsWriter:
         self._file.write(json.dumps(finite) + "\n")
         for name, value in finite.items():
             if value is not None:
-                self._events.add_scalar(name, value, int(metrics["env_steps"]))
+                event = Event(
+                    wall_time=time.time(),
+                    step=int(metrics["env_steps"]),
+                    summary=scalar(name, value),
+                )
+                self._events.write_event(event)
+        self._events.flush()
 
 
 def keep_metrics(folder: pathlib.Path, env_steps: int) -> None:
@@ -52,9 +64,18 @@ def keep_metrics(folder: pathlib.Path, env_steps: int) -> None:
 
 def last_wall_s(folder: pathlib.Path) -> float:
     """Seconds that the run in this folder has trained for, 0 where there is none."""
+    return _last(folder, "wall_s")
+
+
+def last_env_steps(folder: pathlib.Path) -> int:
+    """Environment steps that the metrics in this folder reach to, 0 where there are none."""
+    return int(_last(folder, "env_steps"))
+
+
+def _last(folder: pathlib.Path, name: str) -> float:
     path = folder / "metrics.jsonl"
-    rows = read_metrics(folder) if path.is_file() else []
-    return rows[-1]["wall_s"] if rows else 0.0
+    rows = _read_rows(path) if path.is_file() else []
+    return rows[-1][name] if rows else 0.0
 
 
 def read_metrics(folder: pathlib.Path) -> list[dict[str, float]]:
@@ -66,5 +87,14 @@ def read_metrics(folder: pathlib.Path) -> list[dict[str, float]]:
     path = folder / "metrics.jsonl"
     if not path.is_file():
         raise ValueError(f"{folder} is no run folder: it has no metrics.jsonl")
-    rows = [json.loads(line) for line in path.read_text().splitlines()]
+    rows = _read_rows(path)
+    if not rows:
+        raise ValueError(f"{path} holds no metrics yet: wait for the first chunk of the run")
+    return rows
+
+
+def _read_rows(path: pathlib.Path) -> list[dict[str, float]]:
+    # A process that was killed may have left half a line.
+    lines = [x for x in path.read_text().splitlines(keepends=True) if x.endswith("\n")]
+    rows = [json.loads(line) for line in lines]
     return [{k: float("nan") if v is None else v for k, v in row.items()} for row in rows]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import os
 import pathlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
 import jax
@@ -19,6 +19,8 @@ from mjx_arm.render import make_renderer, rgb
 
 _EDGE = 384
 _FRAMES_PER_SECOND = 30
+# Frames drawn in one call.
+_AT_ONCE = 50
 
 
 @dataclasses.dataclass(frozen=True)
@@ -68,11 +70,11 @@ def record_episode(
     return Episode(qpos=np.concatenate([qpos[:length], after[None]]), success=bool(success.any()))
 
 
-def draw_episode(env: Env, episode: Episode) -> np.ndarray:
+def draw_episode(env: Env, episode: Episode) -> Iterator[np.ndarray]:
     """Draws an episode: the scene with shadows, and the agent's own image, side by side.
 
-    Returns:
-      `[L, 384, 768, 3] uint8`.
+    Yields:
+      Each of its frames, `[384, 768, 3] uint8`; drawn some at a time, for 1,000 are a gigabyte.
     """
     from mjx_arm.kinematics import make_kinematics
 
@@ -86,20 +88,36 @@ def draw_episode(env: Env, episode: Episode) -> np.ndarray:
         pixels = large(poses.geom_xpos, poses.geom_xmat), small(poses.geom_xpos, poses.geom_xmat)
         return rgb(pixels[0]), rgb(pixels[1])
 
-    scene, view = jax.device_get(jax.jit(lambda q: jax.lax.map(draw, q))(episode.qpos))
-    rows = np.arange(_EDGE) * view.shape[1] // _EDGE
-    columns = np.arange(_EDGE) * view.shape[2] // _EDGE
-    return np.concatenate([scene, view[:, rows][:, :, columns]], axis=2)
+    draw_some = jax.jit(lambda q: jax.lax.map(draw, q))
+    rows, columns = (np.arange(_EDGE) * edge // _EDGE for edge in config.size)
+    for start in range(0, len(episode.qpos), _AT_ONCE):
+        qpos = episode.qpos[start : start + _AT_ONCE]
+        # Of one length, or the last ones would compile again.
+        padded = np.concatenate([qpos, np.repeat(qpos[-1:], _AT_ONCE - len(qpos), axis=0)])
+        scenes, views = jax.device_get(draw_some(padded))
+        for scene, view in zip(scenes[: len(qpos)], views, strict=False):
+            yield np.concatenate([scene, view[rows][:, columns]], axis=1)
 
 
-def write_video(path: pathlib.Path, frames: np.ndarray) -> None:
-    """Writes frames `[L, H, W, 3] uint8` as MP4 or GIF, by the ending of `path`.
+def check_video_path(path: pathlib.Path) -> None:
+    """Refuses a path that `write_video` could not write to.
 
     Raises:
-      ValueError: another ending.
+      ValueError: its ending is neither `.mp4` nor `.gif`, or its folder is not there.
     """
     if path.suffix not in (".mp4", ".gif"):
         raise ValueError(f"{path} ends in {path.suffix!r}: give a path ending in .mp4 or .gif")
+    if path.is_dir() or not path.absolute().parent.is_dir():
+        raise ValueError(f"{path} cannot be written: give a file in a folder that exists")
+
+
+def write_video(path: pathlib.Path, frames: Iterable[np.ndarray]) -> None:
+    """Writes frames `[H, W, 3] uint8` as MP4 or GIF, by the ending of `path`: whole, or not at all.
+
+    Raises:
+      ValueError: another ending, or it could not be written.
+    """
+    check_video_path(path)
     # Without it the encoder is forked from a process full of threads, which may deadlock.
     os.environ.setdefault("IMAGEIO_FFMPEG_NO_PREVENT_SIGINT", "1")
     import imageio.v2 as imageio
@@ -107,4 +125,16 @@ def write_video(path: pathlib.Path, frames: np.ndarray) -> None:
     options: dict[str, Any] = {"fps": _FRAMES_PER_SECOND, "macro_block_size": 16}
     if path.suffix == ".gif":
         options = {"duration": 1000 / _FRAMES_PER_SECOND, "loop": 0}
-    imageio.mimsave(path, list(frames), **options)
+    part = path.with_name(f"{path.stem}.part{path.suffix}")
+    try:
+        writer: Any
+        with imageio.get_writer(part, **options) as writer:
+            for frame in frames:
+                writer.append_data(frame)
+        part.replace(path)
+    except OSError as error:
+        # What imageio says of its encoder goes on for many lines.
+        reason = str(error.strerror or error).splitlines()[0]
+        raise ValueError(f"{path} could not be written: {reason}") from error
+    finally:
+        part.unlink(missing_ok=True)
