@@ -44,7 +44,18 @@ def load_tree(path: pathlib.Path, like: Any) -> Any:
     """
     import orbax.checkpoint as ocp
 
-    # Checked beforehand: a read that fails half-way leaves orbax with coroutines to complain of.
+    # A read that fails half-way leaves orbax with coroutines to complain of.
+    check_tree(path, like)
+    with ocp.StandardCheckpointer() as checkpointer:
+        return _from_data(checkpointer.restore(path.absolute(), _to_data(like)), like)
+
+
+def check_tree(path: pathlib.Path, like: Any) -> None:
+    """Refuses what `load_tree` could not read.
+
+    Raises:
+      ValueError: there is no checkpoint, or it is damaged, or of something else.
+    """
     if not (path / _MANIFEST).is_file():
         raise ValueError(f"{path} is not a checkpoint, or not a whole one")
     files, arrays = _read_manifest(path)
@@ -52,8 +63,6 @@ def load_tree(path: pathlib.Path, like: Any) -> Any:
         raise ValueError(f"{path} is damaged: its files are not those that were written")
     if arrays != _describe(like):
         raise ValueError(f"{path} is not a checkpoint of such a run")
-    with ocp.StandardCheckpointer() as checkpointer:
-        return _from_data(checkpointer.restore(path.absolute(), _to_data(like)), like)
 
 
 def _read_manifest(path: pathlib.Path) -> tuple[Any, Any]:
@@ -95,14 +104,14 @@ class RunCheckpoints:
         Raises:
           ValueError: it could not be written.
         """
-        path = self.folder / f"{vector_step:0{_DIGITS}d}"
+        path = self._path(vector_step)
         try:
             save_tree(path, state)
         except ValueError:
             shutil.rmtree(path, ignore_errors=True)
             raise
         for step in self.steps()[:-_KEPT]:
-            shutil.rmtree(self.folder / f"{step:0{_DIGITS}d}")
+            shutil.rmtree(self._path(step))
 
     def steps(self) -> list[int]:
         """Vector steps of the checkpoints there are, the oldest first."""
@@ -117,8 +126,8 @@ class RunCheckpoints:
         steps = self.steps()
         return f"{steps[-1]:0{_DIGITS}d}" if steps else None
 
-    def load_newest(self, like: Any) -> tuple[Any, int]:
-        """Reads the newest checkpoint.
+    def find_newest(self, like: Any) -> int:
+        """The vector step of the newest checkpoint, which `load` can read.
 
         Raises:
           ValueError: there is none, or it is damaged; names the newest whole one, if there is one.
@@ -127,11 +136,12 @@ class RunCheckpoints:
         if not steps:
             raise ValueError(f"{self.folder} holds no checkpoint to go on from")
         try:
-            return self.load(steps[-1], like), steps[-1]
+            check_tree(self._path(steps[-1]), like)
+            return steps[-1]
         except ValueError as error:
             for step in reversed(steps[:-1]):
                 try:
-                    self.load(step, like)
+                    check_tree(self._path(step), like)
                 except ValueError:
                     continue
                 raise ValueError(
@@ -145,7 +155,10 @@ class RunCheckpoints:
         Raises:
           ValueError: it is damaged, or of another run.
         """
-        return load_tree(self.folder / f"{step:0{_DIGITS}d}", like)
+        return load_tree(self._path(step), like)
+
+    def _path(self, step: int) -> pathlib.Path:
+        return self.folder / f"{step:0{_DIGITS}d}"
 
 
 def _is_key(leaf: Any) -> bool:

@@ -120,14 +120,20 @@ def resume(
     if total_steps is not None:
         config = dataclasses.replace(config, total_steps=total_steps)
     trainer = _prepare(config, console)
-    # Before the state is held, or its memory would count as needed and as taken.
-    run_chunk = _compile(trainer, console)
-    state, vector_step = _load_state(trainer, folder)
+    checkpoints = RunCheckpoints(folder)
+    saved_any = _has_saved(trainer, folder)
+    vector_step = checkpoints.find_newest(_shapes(trainer)) if saved_any else 0
     if config.total_steps < min(vector_step * config.num_envs, saved.total_steps):
         raise ValueError(
             f"--total-steps is {total_steps}: the run has made "
             f"{vector_step * config.num_envs} already, give more"
         )
+    # Before the state is held, or its memory would count as needed and as taken.
+    run_chunk = _compile(trainer, console)
+    if saved_any:
+        state = checkpoints.load(vector_step, _shapes(trainer))
+    else:
+        state = trainer.init(run_keys(config))
     if config != saved:
         _save_configs(folder, config)
     for seed_folder in seed_folders(folder, config):
@@ -142,18 +148,12 @@ def _check_episodes(eval_episodes: int) -> None:
         raise ValueError(f"eval_episodes is {eval_episodes}: give at least 1")
 
 
-def _load_state(trainer: Trainer, folder: pathlib.Path) -> tuple[LoopState, int]:
-    """The state to go on from and its vector step: the start of a run that has not saved one yet.
-
-    Raises:
-      ValueError: there is none, or it is damaged.
-    """
-    config, checkpoints = trainer.config, RunCheckpoints(folder)
-    own = seed_folders(folder, config)[0]
+def _has_saved(trainer: Trainer, folder: pathlib.Path) -> bool:
+    """Whether a run got as far as its first checkpoint."""
+    config = trainer.config
     unsaved = _SAVE_EVERY * config.chunk_length * config.num_envs
-    if checkpoints.newest() is None and last_env_steps(own) <= unsaved:
-        return trainer.init(run_keys(config)), 0
-    return checkpoints.load_newest(_shapes(trainer))
+    reached = last_env_steps(seed_folders(folder, config)[0])
+    return RunCheckpoints(folder).newest() is not None or reached > unsaved
 
 
 def _prepare(config: TrainConfig, console: Console) -> Trainer:

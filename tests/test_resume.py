@@ -38,7 +38,9 @@ KILLS = 10
 def final_state(folder: pathlib.Path):
     config = load_config(folder)
     like = jax.eval_shape(make_trainer(config).init, jax.random.key(0))
-    state, step = RunCheckpoints(folder).load_newest(like)
+    checkpoints = RunCheckpoints(folder)
+    step = checkpoints.find_newest(like)
+    state = checkpoints.load(step, like)
     return jax.tree.map(
         lambda x: (
             np.asarray(jax.random.key_data(x))
