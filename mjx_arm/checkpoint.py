@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
+import logging
 import pathlib
 import shutil
+import threading
 import zlib
+from collections.abc import Iterator
 from typing import Any
 
 import jax
@@ -25,7 +29,7 @@ def save_tree(path: pathlib.Path, tree: Any) -> None:
     import orbax.checkpoint as ocp
 
     try:
-        with ocp.StandardCheckpointer() as checkpointer:
+        with _without_tracebacks(), ocp.StandardCheckpointer() as checkpointer:
             checkpointer.save(path.absolute(), _to_data(tree), force=True)
         manifest = {"files": _checksums(path), "arrays": _describe(tree)}
         part = path / f"{_MANIFEST}.part"
@@ -34,6 +38,22 @@ def save_tree(path: pathlib.Path, tree: Any) -> None:
     except (OSError, ValueError) as error:
         reason = " ".join(str(error).split())[:200]
         raise ValueError(f"the checkpoint {path} could not be written: {reason}") from error
+
+
+@contextlib.contextmanager
+def _without_tracebacks() -> Iterator[None]:
+    """Keeps orbax from telling of a failure thread by thread: it raises what they raised as well."""
+    hook, loggers = threading.excepthook, [logging.getLogger(name) for name in ("absl", "asyncio")]
+    before = [logger.disabled for logger in loggers]
+    threading.excepthook = lambda args: None
+    for logger in loggers:
+        logger.disabled = True
+    try:
+        yield
+    finally:
+        threading.excepthook = hook
+        for logger, disabled in zip(loggers, before, strict=True):
+            logger.disabled = disabled
 
 
 def load_tree(path: pathlib.Path, like: Any) -> Any:
