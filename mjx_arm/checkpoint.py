@@ -42,7 +42,7 @@ def save_tree(path: pathlib.Path, tree: Any) -> None:
 
 @contextlib.contextmanager
 def _without_tracebacks() -> Iterator[None]:
-    """Keeps orbax from telling of a failure thread by thread: it raises what they raised as well."""
+    """Keeps orbax from telling of a failure thread by thread: it raises it as well."""
     hook, loggers = threading.excepthook, [logging.getLogger(name) for name in ("absl", "asyncio")]
     before = [logger.disabled for logger in loggers]
     threading.excepthook = lambda args: None
