@@ -36,6 +36,8 @@ def save_tree(path: pathlib.Path, tree: Any) -> None:
         part.write_text(json.dumps(manifest))
         part.replace(path / _MANIFEST)
     except (OSError, ValueError) as error:
+        for left in path.parent.glob(f"{path.name}.orbax-checkpoint-tmp*"):
+            shutil.rmtree(left, ignore_errors=True)
         reason = " ".join(str(error).split())[:200]
         raise ValueError(f"the checkpoint {path} could not be written: {reason}") from error
 
@@ -43,7 +45,8 @@ def save_tree(path: pathlib.Path, tree: Any) -> None:
 @contextlib.contextmanager
 def _without_tracebacks() -> Iterator[None]:
     """Keeps orbax from telling of a failure thread by thread: it raises it as well."""
-    hook, loggers = threading.excepthook, [logging.getLogger(name) for name in ("absl", "asyncio")]
+    hook = threading.excepthook
+    loggers = [logging.getLogger(name) for name in ("absl", "asyncio")]
     before = [logger.disabled for logger in loggers]
     threading.excepthook = lambda args: None
     for logger in loggers:

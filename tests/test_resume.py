@@ -232,9 +232,11 @@ def test_a_disk_that_fills_up_leaves_the_last_whole_checkpoint(tmp_path):
     assert done.returncode == 2
     newest = RunCheckpoints(folder).newest()
     assert newest == f"{500:012d}"
-    assert f"checkpoints/{1000:012d} could not be written" in done.stderr
-    assert f"--resume goes on from {newest}" in done.stderr
-    assert done.stderr.count("\n") == 1
+    # The last line: tensorstore tells before it of other writes that were under way.
+    said = done.stderr.splitlines()[-1]
+    assert f"checkpoints/{1000:012d} could not be written" in said
+    assert f"--resume goes on from {newest}" in said
+    assert not list(folder.glob("checkpoints/*tmp*"))
     # Room again.
     assert main(["train", "--resume", str(folder), "--eval-episodes", "4"]) == 0
     assert load_agent(folder / "last.agent").env_steps == 4000
