@@ -34,8 +34,8 @@ def in_parts(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
 def overwrite_in_parts(function: Callable[[Any], Any], batch: Any, old: Any) -> Any:
     """`in_parts(function)(batch)`, written over `old`.
 
-    For the carry of a scan: a result of its own would be filled with zeros first, and copied into
-    the carry last, which for 4,096 images takes as long as a third of drawing them.
+    For the carry of a scan: a result of its own would be filled with zeros first, copied into the
+    carry last, and held beside it.
 
     Args:
       function: as in `in_parts`.
