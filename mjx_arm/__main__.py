@@ -1,7 +1,5 @@
 """`python -m mjx_arm`: the command line."""
 
-import sys
+from mjx_arm.cli import run
 
-from mjx_arm.cli import main
-
-sys.exit(main())
+run()

@@ -9,10 +9,13 @@ import datetime
 import io
 import itertools
 import json
+import os
 import pathlib
+import signal
 import sys
 from collections.abc import Sequence
-from typing import Annotated, Any
+from types import FrameType
+from typing import Annotated, Any, NoReturn
 
 import tyro
 from rich.console import Console
@@ -226,7 +229,26 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except RunInterruptedError as stop:
         print(stop, file=sys.stderr)
         return 130
-    except KeyboardInterrupt:
-        print("stopped", file=sys.stderr)
-        return 130
     return 0
+
+
+def run(arguments: Sequence[str] | None = None) -> NoReturn:
+    """Runs the command line as a process of its own, and ends it.
+
+    Ctrl-C ends it where it stands, which no file minds, except while a run trains and saves first.
+    """
+    signal.signal(signal.SIGINT, _stop)
+    sys.exit(main(arguments))
+
+
+def _stop(number: int, frame: FrameType | None) -> NoReturn:
+    """Ends the process at once.
+
+    A KeyboardInterrupt would be lost inside of a compilation, or leave one running that crashes
+    when Python shuts down around it.
+    """
+    # Not by print, which may be what the signal came into.
+    if os.isatty(1):
+        os.write(1, b"\x1b[?25h")  # the cursor, which a progress bar hides
+    os.write(2, b"stopped; a run that has begun goes on with --resume and its folder\n")
+    os._exit(130)

@@ -324,7 +324,7 @@ def _is_due(config: TrainConfig, chunk: int) -> bool:
 
 
 class _Interruption:
-    """Turns the first Ctrl-C into a wish to stop after the chunk; the second one stops at once."""
+    """Turns the first Ctrl-C into a wish to stop after the chunk; the second one is as before."""
 
     def __init__(self) -> None:
         self.asked = False
@@ -342,8 +342,8 @@ class _Interruption:
         signal.signal(signal.SIGINT, self._before)
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
-        if self.asked:
-            raise KeyboardInterrupt
+        if self.asked and callable(self._before):
+            self._before(number, frame)
         self.asked = True
 
 

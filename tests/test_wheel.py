@@ -47,7 +47,7 @@ def test_wheel_holds_the_package_and_no_more(wheel: Path) -> None:
     assert {f"mjx_arm/{scene}" for scene in scenes} <= names
     assert info.endswith(".dist-info")
     assert f"{info}/licenses/LICENSE" in names
-    assert "mjx-arm = mjx_arm.cli:main" in entry_points
+    assert "mjx-arm = mjx_arm.cli:run" in entry_points
 
 
 def test_scene_loads_from_the_installed_wheel(wheel: Path, tmp_path: Path) -> None:
