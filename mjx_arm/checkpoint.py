@@ -5,14 +5,18 @@ from __future__ import annotations
 import contextlib
 import json
 import logging
+import os
 import pathlib
 import shutil
+import tempfile
 import threading
 import zlib
 from collections.abc import Iterator
 from typing import Any
 
 import jax
+
+from mjx_arm.memory import tree_size
 
 _KEPT = 2
 _DIGITS = 12
@@ -29,6 +33,7 @@ def save_tree(path: pathlib.Path, tree: Any) -> None:
     import orbax.checkpoint as ocp
 
     try:
+        _check_room(path.parent, tree_size(tree))
         with _without_tracebacks(), ocp.StandardCheckpointer() as checkpointer:
             checkpointer.save(path.absolute(), _to_data(tree), force=True)
         manifest = {"files": _checksums(path), "arrays": _describe(tree)}
@@ -40,6 +45,18 @@ def save_tree(path: pathlib.Path, tree: Any) -> None:
             shutil.rmtree(left, ignore_errors=True)
         reason = " ".join(str(error).split())[:200]
         raise ValueError(f"the checkpoint {path} could not be written: {reason}") from error
+
+
+def _check_room(folder: pathlib.Path, size: int) -> None:
+    """Takes `size` bytes of the disk and gives them back.
+
+    A write of orbax that fails prints tracebacks from threads that nothing here can reach.
+    """
+    if not hasattr(os, "posix_fallocate"):
+        return
+    folder.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryFile(dir=folder) as file:
+        os.posix_fallocate(file.fileno(), 0, size)
 
 
 @contextlib.contextmanager
