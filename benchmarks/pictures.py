@@ -10,7 +10,6 @@ import sys
 
 import imageio.v3 as imageio
 import jax
-import jax.numpy as jnp
 import mujoco
 import numpy as np
 
@@ -23,7 +22,7 @@ EDGE = 320
 
 
 def main(folder: pathlib.Path) -> None:
-    """Writes `scene.png`, ours above and MuJoCo's below, and `pixels.png`, what an agent sees."""
+    """Writes `scene.png`, ours above and MuJoCo's below."""
     env = mjx_arm.make("A", physics="native", observation="packed")
     policy = jax.jit(make_scripted_policy(env))
     step = jax.jit(env.transition)
@@ -31,13 +30,12 @@ def main(folder: pathlib.Path) -> None:
     model = env.scene.mj_model
     data = mujoco.MjData(model)
     _, state = env.reset(jax.random.key(0))
-    ours, theirs, seen = [], [], []
+    ours, theirs = [], []
     with mujoco.Renderer(model, EDGE, EDGE) as renderer:
         for moment in range(max(MOMENTS) + 1):
             if moment in MOMENTS:
                 poses = state.physics.poses
                 ours.append(np.asarray(mjx_arm.rgb(large(poses.geom_xpos, poses.geom_xmat))))
-                seen.append(np.asarray(mjx_arm.rgb(env.observe(state))))
                 data.qpos[:] = state.physics.qpos
                 mujoco.mj_forward(model, data)
                 renderer.update_scene(data, env.config.camera)
@@ -46,8 +44,6 @@ def main(folder: pathlib.Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     both = [np.concatenate(row, axis=1) for row in (ours, theirs)]
     imageio.imwrite(folder / "scene.png", np.concatenate(both, axis=0))
-    enlarged = jnp.repeat(jnp.repeat(np.concatenate(seen, axis=1), 5, axis=0), 5, axis=1)
-    imageio.imwrite(folder / "pixels.png", np.asarray(enlarged))
 
 
 if __name__ == "__main__":
