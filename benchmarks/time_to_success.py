@@ -6,7 +6,8 @@ The time of ours is in the metrics of a run: that of the first selection in whic
 held-out episodes succeeded. Stable-Baselines3 then trains for at most 5 times as long, once with
 the best of ours (our network, 64 of our environments in one call, our reward, exploration, 3-step
 returns and averaged target, which also is what is judged), once with its defaults on one of our
-environments, and is judged as often and in the same way.
+environments, and is judged as often and in the same way. Both take hours: with `--keep FOLDER` they
+are saved at every judgement, which their time does not count, and the same command goes on.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import argparse
 import json
 import math
 import pathlib
+import shutil
 import time
 from collections.abc import Callable
 from typing import Any
@@ -25,6 +27,7 @@ import torch
 from machine import machine
 from peers import TorchNetwork
 from stable_baselines3 import DQN
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
@@ -153,12 +156,14 @@ class Judging(BaseCallback):
         every: int,
         minutes: float,
         averaged: bool,
-        report: Callable[[dict[str, Any]], None],
+        before: dict[str, Any] | None,
+        report: Callable[[dict[str, Any], BaseAlgorithm], None],
     ):
         super().__init__()
         self._judge, self._every, self._minutes = judge, every, minutes
         self._averaged, self._report = averaged, report
-        self._next, self._started = every, time.perf_counter()
+        self._next = every + (before["env_steps"] if before else 0)
+        self._started = time.perf_counter() - 60 * (before["minutes"] if before else 0)
 
     def _on_step(self) -> bool:
         if self.num_timesteps >= self._next:
@@ -167,30 +172,70 @@ class Judging(BaseCallback):
             network = policy.q_net_target if self._averaged else policy.q_net
             network.set_training_mode(False)
             rate = self._judge.success_rate(network)
-            self._report({"minutes": self._spent(), "env_steps": self.num_timesteps, "rate": rate})
+            row = {"minutes": self.spent(), "env_steps": self.num_timesteps, "rate": rate}
+            started = time.perf_counter()
+            self._report(row, self.model)
+            self._started += time.perf_counter() - started
             if rate >= _GOAL:
                 return False
-        return self._spent() < self._minutes
+        return self.spent() < self._minutes
 
-    def _spent(self) -> float:
+    def spent(self) -> float:
+        """Minutes of training and judging so far, those before it was gone on with included."""
         return (time.perf_counter() - self._started) / 60
 
 
+class Keep:
+    """Where a learner and its result wait to be gone on with."""
+
+    def __init__(self, folder: pathlib.Path, name: str):
+        self._folder = folder / name.replace(", ", "-").replace(" ", "-")
+
+    def save(self, agent: BaseAlgorithm, result: dict[str, Any]) -> None:
+        """Writes both; the one before counts until this is whole."""
+        part = self._folder.with_suffix(".part")
+        shutil.rmtree(part, ignore_errors=True)
+        part.mkdir(parents=True)
+        agent.save(part / "agent.zip")
+        agent.save_replay_buffer(part / "replay.pkl")
+        (part / "result.json").write_text(json.dumps(result))
+        shutil.rmtree(self._folder, ignore_errors=True)
+        part.rename(self._folder)
+
+    def load(self, agent: DQN) -> tuple[DQN, dict[str, Any] | None]:
+        """The agent and its result as they were saved, or the agent that is given."""
+        if not self._folder.is_dir():
+            return agent, None
+        agent = DQN.load(self._folder / "agent.zip", env=agent.get_env())
+        agent.load_replay_buffer(self._folder / "replay.pkl")
+        return agent, json.loads((self._folder / "result.json").read_text())
+
+
 def their_time(
-    name: str, config: TrainConfig, minutes: float, write: Callable[[dict[str, Any]], None]
+    name: str,
+    config: TrainConfig,
+    minutes: float,
+    keep: Keep | None,
+    write: Callable[[dict[str, Any]], None],
 ) -> None:
     """Trains one of theirs, and reports after every judgement."""
     make, averaged = LEARNERS[name]
-    result: dict[str, Any] = {
+    agent, before = make(config, config.total_steps), None
+    if keep is not None:
+        agent, before = keep.load(agent)
+    result: dict[str, Any] = before or {
         "learner": name,
         "seed": config.seed,
         "episodes": config.select_episodes,
-        "most_minutes": minutes,
         "judged": [],
         "reached": None,
     }
+    result["most_minutes"] = minutes
+    if result["reached"]:
+        write(result)
+        return
 
-    def report(row: dict[str, Any]) -> None:
+    def report(row: dict[str, Any], agent: BaseAlgorithm) -> None:
         result["judged"].append(row)
         result["reached"] = row if row["rate"] >= _GOAL else None
         low, high = wilson_interval(
@@ -202,13 +247,20 @@ def their_time(
             flush=True,
         )
         write(result)
+        if keep is not None:
+            keep.save(agent, result)
 
-    agent = make(config, config.total_steps)
     judging = Judging(
-        Judge(config), every=config.select_every, minutes=minutes, averaged=averaged, report=report
+        Judge(config),
+        every=config.select_every,
+        minutes=minutes,
+        averaged=averaged,
+        before=result["judged"][-1] if result["judged"] else None,
+        report=report,
     )
-    agent.learn(config.total_steps, callback=judging, log_interval=10**9)
-    result["minutes"], result["env_steps"] = judging._spent(), agent.num_timesteps
+    left = config.total_steps - agent.num_timesteps
+    agent.learn(left, callback=judging, log_interval=10**9, reset_num_timesteps=before is None)
+    result["minutes"], result["env_steps"] = judging.spent(), agent.num_timesteps
     write(result)
 
 
@@ -219,6 +271,7 @@ def main() -> None:
     parser.add_argument("--learners", nargs="+", choices=LEARNERS, default=list(LEARNERS))
     parser.add_argument("--minutes", type=float, help="5 times ours where left out")
     parser.add_argument("--threads", type=int, help="of PyTorch; all cores where left out")
+    parser.add_argument("--keep", type=pathlib.Path, help="folder to go on from another time")
     parser.add_argument("--json", type=pathlib.Path, help="file for the results")
     options = parser.parse_args()
     if options.threads:
@@ -227,7 +280,11 @@ def main() -> None:
     if options.minutes is None and ours["reached"] is None:
         parser.error(f"{options.run} never reached {_GOAL:.0%}: give --minutes")
     minutes = options.minutes or 5 * ours["reached"]["minutes"]
-    results = {"mjx_arm": ours}
+    # One learner at a time may be asked for: the results of the others stay.
+    results = {}
+    if options.json and options.json.is_file():
+        results = {row["learner"]: row for row in json.loads(options.json.read_text())["results"]}
+    results["mjx_arm"] = ours
 
     def write(result: dict[str, Any]) -> None:
         results[result["learner"]] = result
@@ -238,7 +295,8 @@ def main() -> None:
 
     print(f"mjx_arm: {_GOAL:.0%} after {ours['reached'] and ours['reached']['minutes']} minutes")
     for name in options.learners:
-        their_time(name, load_config(options.run), minutes, write)
+        keep = Keep(options.keep, name) if options.keep else None
+        their_time(name, load_config(options.run), minutes, keep, write)
 
 
 if __name__ == "__main__":
