@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import mjx_arm
-from mjx_arm.evaluate import evaluate, newcombe_interval, wilson_interval
+from mjx_arm.evaluate import evaluate, make_evaluator, newcombe_interval, wilson_interval
 from mjx_arm.task import NUM_ACTIONS, OPEN
 
 EPISODES = 1000
@@ -49,9 +49,8 @@ def test_every_episode_counts_when_they_do_not_divide_evenly(env):
 
 
 def test_two_seeds_give_two_results(env):
-    results = [
-        evaluate(env, fake_policy, None, episodes=20, epsilon=0.5, seed=seed) for seed in (1, 1, 2)
-    ]
+    evaluate_params = make_evaluator(env, fake_policy, episodes=20, epsilon=0.5)
+    results = [evaluate_params(None, seed) for seed in (1, 1, 2)]
     assert results[0] == results[1]
     assert results[0] != results[2]
 

@@ -10,6 +10,7 @@ import pytest
 import mjx_arm
 from mjx_arm.config import PRESETS, TrainConfig
 from mjx_arm.loop import (
+    Trainer,
     epsilon_at,
     make_body,
     make_train,
@@ -43,12 +44,15 @@ def bits(tree):
 
 def train(config: TrainConfig, chunks: int = 3):
     trainer = make_trainer(config)
-    state = trainer.init(run_keys(config))
-    rows = []
+    return trainer, *run_chunks(trainer, run_keys(config), chunks)
+
+
+def run_chunks(trainer: Trainer, key: jax.Array, chunks: int):
+    config, state, rows = trainer.config, trainer.init(key), []
     for chunk in range(1, chunks + 1):
         state, counts = trainer.run_chunk(state)
         rows.append(summarise(config, jax.device_get(counts), chunk * config.chunk_length))
-    return trainer, state, rows
+    return state, rows
 
 
 @pytest.fixture(scope="module")
@@ -85,11 +89,11 @@ def test_learning_changes_the_parameters(run):
 
 
 def test_the_same_seed_gives_the_same_bits_and_another_seed_does_not(run):
-    _, state, _ = run
-    _, again, _ = train(CONFIG)
+    trainer, state, _ = run
+    again, _ = run_chunks(trainer, run_keys(CONFIG), 3)
     for one, other in zip(bits(state), bits(again), strict=True):
         np.testing.assert_array_equal(one, other)
-    _, different, _ = train(dataclasses.replace(CONFIG, seed=1), chunks=1)
+    different, _ = run_chunks(trainer, run_keys(dataclasses.replace(CONFIG, seed=1)), 1)
     pairs = zip(
         *map(jax.tree.leaves, (state.learner.params, different.learner.params)), strict=True
     )
@@ -168,11 +172,11 @@ def test_state_features_train_too():
 @pytest.mark.parametrize("storage", [pytest.param("states", marks=pytest.mark.slow), "pixels"])
 def test_seeds_side_by_side_are_the_runs_one_by_one(storage):
     config = dataclasses.replace(CONFIG, storage=storage)
-    _, both, _ = train(dataclasses.replace(config, num_seeds=2), chunks=0)
     trainer = make_trainer(dataclasses.replace(config, num_seeds=2))
-    both, counts = trainer.run_chunk(both)
+    both, counts = trainer.run_chunk(trainer.init(run_keys(trainer.config)))
+    single = make_trainer(config)
     for seed in (0, 1):
-        _, alone, _ = train(dataclasses.replace(config, seed=seed), chunks=1)
+        alone, _ = run_chunks(single, run_keys(dataclasses.replace(config, seed=seed)), 1)
         np.testing.assert_array_equal(both.replay.steps.action[seed], alone.replay.steps.action)
         for a, b in zip(
             jax.tree.leaves(both.learner.params), jax.tree.leaves(alone.learner.params), strict=True

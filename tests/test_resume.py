@@ -25,6 +25,8 @@ from mjx_arm.memory import tree_size
 from mjx_arm.report.metrics import read_metrics
 
 OPTIONS = [
+    # State features compile in a fraction of the time; the runs that are killed learn from pixels.
+    *("--observation", "state"),
     *("--physics", "native", "--num-envs", "4", "--size", "16", "16", "--replay-size", "400"),
     *("--batch-size", "8", "--learning-starts", "40", "--chunk-steps", "200"),
     *("--max-steps", "25", "--hidden", "16", "--eval-episodes", "4"),
@@ -195,7 +197,8 @@ def test_checkpoints_are_small_however_full_the_replay():
 
 def test_a_full_disk_is_said_and_leaves_nothing_that_counts(tmp_path):
     folder = tmp_path / "run"
-    arguments = command(*OPTIONS, "--total-steps", "2000", "--out", str(folder))
+    options = [*OPTIONS, "--observation", "packed"]
+    arguments = command(*options, "--total-steps", "2000", "--out", str(folder))
     # No file may grow beyond 20 kB: the write fails as on a full disk, with another number.
     limit = "import resource, os, sys; resource.setrlimit(resource.RLIMIT_FSIZE, (20_000,) * 2); "
     limited = [sys.executable, "-c", limit + "os.execv(sys.argv[1], sys.argv[1:])", *arguments]
@@ -226,7 +229,7 @@ def test_a_disk_that_fills_up_leaves_the_last_whole_checkpoint(tmp_path):
     folder = tmp_path / "run"
     # A file of the checkpoint is larger than what then fits, an agent smaller.
     options = ["train", *OPTIONS, "--total-steps", "4000", "--replay-size", "20000"]
-    options += ["--storage", "pixels"]
+    options += ["--observation", "packed", "--storage", "pixels"]
     started = [sys.executable, "-c", LATER, str(folder), *options, "--out", str(folder)]
     done = subprocess.run(started, capture_output=True, text=True)
     assert done.returncode == 2
@@ -243,7 +246,7 @@ def test_a_disk_that_fills_up_leaves_the_last_whole_checkpoint(tmp_path):
 
 @pytest.mark.slow
 def test_a_killed_run_goes_on_to_the_same_bits(tmp_path):
-    total = ("--total-steps", str(TOTAL_STEPS))
+    total = ("--total-steps", str(TOTAL_STEPS), "--observation", "packed")
     whole = tmp_path / "whole"
     started = time.monotonic()
     subprocess.run(command(*OPTIONS, *total, "--out", str(whole)), check=True, env=os.environ)

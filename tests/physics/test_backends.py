@@ -93,7 +93,7 @@ def test_a_poisoned_state_ends_its_own_episode_only(lab, in_empty_folder, capfd)
     assert capfd.readouterr() == ("", "")
 
 
-@pytest.mark.parametrize("backend", ["native", "mjx"])
+@pytest.mark.parametrize("backend", ["native", pytest.param("mjx", marks=pytest.mark.slow)])
 def test_nested_vmap_gives_the_same_as_flat(labs, backend):
     lab = labs[backend]
     qpos, _ = lab.home()
