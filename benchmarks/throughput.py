@@ -90,7 +90,8 @@ def peak_memory(config: mjx_arm.TrainConfig) -> dict[str, int]:
     key = jax.random.key(0)
     shapes = jax.eval_shape(trainer.init, key)
     init, run = trainer.init.lower(key).compile(), trainer.run_chunk.lower(shapes).compile()
-    planned = sum(memory_plan(shapes).values()) + working_memory(run)
+    working = working_memory(run, trainer.env.physics, config.num_envs)
+    planned = sum(memory_plan(shapes).values()) + working
     gc.collect()
 
     def train() -> None:

@@ -9,9 +9,11 @@ from typing import Any
 import jax
 import numpy as np
 
+from mjx_arm.physics import Physics
+
 _FIELDS = ("learner", "envs", "obs", "replay")
 # What matrix products pack their operands into, which XLA does not count: measured with
-# benchmarks/throughput.py, 19 to 22 MB at 64 and 1,024 environments.
+# benchmarks/throughput.py, 19 to 22 MB at 16 to 4,096 environments.
 _CPU_WORKSPACE = 20_000_000
 
 
@@ -20,11 +22,15 @@ def memory_plan(state: Any) -> dict[str, int]:
     return {name: tree_size(getattr(state, name)) for name in _FIELDS}
 
 
-def working_memory(compiled: jax.stages.Compiled) -> int:
-    """Bytes that a compiled program needs beside its arguments and results while it runs."""
+def working_memory(compiled: jax.stages.Compiled, physics: Physics, simulations: int) -> int:
+    """Bytes that a compiled program needs beside its arguments and results while it runs.
+
+    Those of so many simulations on the host count where that is the device.
+    """
+    on_cpu = jax.default_backend() == "cpu"
+    host = _CPU_WORKSPACE + physics.host_memory(simulations) if on_cpu else 0
     analysis = compiled.memory_analysis()
-    own = _CPU_WORKSPACE if jax.default_backend() == "cpu" else 0
-    return own + (int(analysis.temp_size_in_bytes) if analysis else 0)
+    return host + (int(analysis.temp_size_in_bytes) if analysis else 0)
 
 
 def check_memory(plan: dict[str, int]) -> None:

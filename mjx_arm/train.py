@@ -174,7 +174,9 @@ def _compile(trainer: Trainer, console: Console) -> RunChunk:
     console.print("compiling")
     shapes = _shapes(trainer)
     compiled = trainer.run_chunk.lower(shapes).compile()
-    plan = memory_plan(shapes) | {"working": working_memory(compiled)}
+    simulations = trainer.config.num_seeds * trainer.config.num_envs
+    working = working_memory(compiled, trainer.env.physics, simulations)
+    plan = memory_plan(shapes) | {"working": working}
     say_working_memory(console, plan)
     check_memory(plan)
     return compiled

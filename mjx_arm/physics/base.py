@@ -42,6 +42,7 @@ class Physics:
       step: `(state, ctrl [nu] float32) -> PhysicsState`, one iteration of `substeps` substeps.
       substeps: physics substeps in one iteration.
       timestep: of one substep, s.
+      host_memory: of so many simulations, bytes that the host holds beside their states.
     """
 
     backend: str
@@ -49,3 +50,4 @@ class Physics:
     step: Callable[[PhysicsState, jax.Array], PhysicsState]
     substeps: int
     timestep: float
+    host_memory: Callable[[int], int] = lambda simulations: 0

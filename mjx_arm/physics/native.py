@@ -64,8 +64,7 @@ class BatchPool:
                 free.append(batch)
 
     def _make(self, size: int) -> mj_batch.Batch:
-        # Threads beyond one per simulation would only be woken for nothing.
-        batch = mj_batch.Batch(self._model, size, nthread=min(size, os.cpu_count() or 1))
+        batch = mj_batch.Batch(self._model, size, nthread=_num_threads(size))
         batch.reset(stage=mujoco.mjtStage.mjSTAGE_NONE)
         # Bound before the first step, since a field is zero until the call after it was bound.
         for name in _POSES:
@@ -197,7 +196,21 @@ def make_native(mj_model: mujoco.MjModel, substeps: int) -> Physics:
             integration=words,
         )
 
-    return Physics("native", init, step, substeps, float(mj_model.opt.timestep))
+    def host_memory(simulations: int) -> int:
+        data = mujoco.MjData(mj_model)
+        # A Batch has one of these for each thread and for itself, and a row for each simulation.
+        working = (_num_threads(simulations) + 1) * (data.narena + data.nbuffer)
+        poses = sum(math.prod(shape) for shape in layout.poses.values())
+        row = mujoco.mj_stateSize(mj_model, int(_STATE.mjSTATE_INTEGRATION)) + poses
+        return int(working + 8 * row * simulations)
+
+    timestep = float(mj_model.opt.timestep)
+    return Physics("native", init, step, substeps, timestep, host_memory)
+
+
+def _num_threads(simulations: int) -> int:
+    """Threads beyond one per simulation would only be woken for nothing."""
+    return min(simulations, os.cpu_count() or 1)
 
 
 def _call_host(
