@@ -16,6 +16,7 @@ import argparse
 import concurrent.futures
 import ctypes
 import dataclasses
+import functools
 import gc
 import importlib.util
 import itertools
@@ -97,8 +98,8 @@ def peak_memory(config: mjx_arm.TrainConfig) -> dict[str, int]:
     def train() -> None:
         state = init(key)
         for _ in range(2):
-            state, _ = run(state)
-        jax.block_until_ready(state)
+            # As training does; else the second gets its own room while the first is at work.
+            state, _ = jax.block_until_ready(run(state))
 
     grown = heap_growth(train)
     stats = jax.devices()[0].memory_stats()
@@ -161,7 +162,7 @@ def peak_memory_apart(config: mjx_arm.TrainConfig) -> dict[str, int]:
 
 
 def env_stages(env: mjx_arm.Env, num_envs: int, length: int) -> dict[str, Callable[[Any], Any]]:
-    """The stages of the environment, as functions of the environments' state."""
+    """The stages of the environment, as functions of the environments' state and their images."""
     auto = mjx_arm.AutoReset(env)
     keys = jax.random.split(jax.random.key(1), length)
 
@@ -169,30 +170,32 @@ def env_stages(env: mjx_arm.Env, num_envs: int, length: int) -> dict[str, Callab
         action = jax.random.randint(key, (num_envs,), 0, env.num_actions)
         return jax.vmap(auto.transition)(jax.random.split(key, num_envs), state, action)[0]
 
-    def draw(state: Any) -> jax.Array:
-        return in_parts(jax.vmap(env.observe))(state.env)
+    def physics(carry: Any) -> Any:
+        return jax.lax.scan(lambda s, key: (step(s, key), None), carry[0], keys)[0]
 
-    def physics(state: Any) -> Any:
-        return jax.lax.scan(lambda s, key: (step(s, key), None), state, keys)[0]
-
-    def render(state: Any) -> Any:
+    def render(carry: Any) -> Any:
         def once(state: Any, shift: jax.Array) -> tuple[Any, jax.Array]:
             # The poses depend on the step, or the image would be drawn once for all of them.
             physics = state.env.physics
             poses = physics.poses.replace(geom_xpos=physics.poses.geom_xpos + shift)
             moved = state.replace(env=state.env.replace(physics=physics.replace(poses=poses)))
-            return state, draw(moved)[:, 0, 0]
+            return state, draw(env, moved)[:, 0, 0]
 
-        return jax.lax.scan(once, state, 1e-6 * jnp.arange(length, dtype=jnp.float32))
+        return jax.lax.scan(once, carry[0], 1e-6 * jnp.arange(length, dtype=jnp.float32))
 
-    def both(state: Any) -> Any:
+    def both(carry: Any) -> Any:
         def once(carry: Any, key: jax.Array) -> tuple[Any, None]:
             state = step(carry[0], key)
             return (state, overwrite_in_parts(jax.vmap(env.observe), state.env, carry[1])), None
 
-        return jax.lax.scan(once, (state, draw(state)), keys)[0]
+        return jax.lax.scan(once, carry, keys)[0]
 
     return {"physics": physics, "render": render, "physics+render": both}
+
+
+def draw(env: mjx_arm.Env, state: Any) -> jax.Array:
+    """Images of all environments."""
+    return in_parts(jax.vmap(env.observe))(state.env)
 
 
 def agent_stages(config: mjx_arm.TrainConfig, length: int) -> dict[str, Callable[[Any], Any]]:
@@ -235,7 +238,7 @@ def rows(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
         (first, rest), itertools.product(*cases)
     ):
         some = argparse.Namespace(**vars(options) | {"stages": stages})
-        length = max(2 if options.quick else 4, options.work // num_envs)
+        length = max(2 if options.quick else 8, options.work // num_envs)
         common = {"size": size, "shadows": shadows, "num_envs": num_envs}
         if set(stages) & set(_ENV_STAGES):
             yield from env_rows(some, physics, common, length, repeats)
@@ -255,9 +258,11 @@ def env_rows(
     state = jax.jit(jax.vmap(mjx_arm.AutoReset(env).reset), compiler_options=flags)(
         jax.random.split(jax.random.key(0), num_envs)
     )[1]
+    # The images from outside, or the first would be drawn in the chunk on top of its steps.
+    carry = state, jax.jit(functools.partial(draw, env))(state)
     for stage, run in env_stages(env, num_envs, length).items():
         if stage in options.stages and not (shadows and stage == "physics"):
-            figures = time_stage(run, state, num_envs * length, repeats, flags)
+            figures = time_stage(run, carry, num_envs * length, repeats, flags)
             yield {"stage": stage, **describe(env), **common, **figures}
 
 
@@ -358,7 +363,8 @@ def plot(rows: list[dict[str, Any]], path: pathlib.Path) -> None:
             axes.errorbar(x, y, spread, marker="o", markersize=4, capsize=2, label=label)
     axes.set(xscale="log", yscale="log", xlabel="environments", ylabel="steps or frames per second")
     axes.grid(alpha=0.3, which="both")
-    axes.legend()
+    if chosen:
+        axes.legend()
     figure.savefig(path, dpi=110)
 
 

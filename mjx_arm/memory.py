@@ -12,9 +12,6 @@ import numpy as np
 from mjx_arm.physics import Physics
 
 _FIELDS = ("learner", "envs", "obs", "replay")
-# What matrix products pack their operands into, which XLA does not count: measured with
-# benchmarks/throughput.py, 19 to 22 MB at 16 to 4,096 environments.
-_CPU_WORKSPACE = 20_000_000
 
 
 def memory_plan(state: Any) -> dict[str, int]:
@@ -27,8 +24,7 @@ def working_memory(compiled: jax.stages.Compiled, physics: Physics, simulations:
 
     Those of so many simulations on the host count where that is the device.
     """
-    on_cpu = jax.default_backend() == "cpu"
-    host = _CPU_WORKSPACE + physics.host_memory(simulations) if on_cpu else 0
+    host = physics.host_memory(simulations) if jax.default_backend() == "cpu" else 0
     analysis = compiled.memory_analysis()
     return host + (int(analysis.temp_size_in_bytes) if analysis else 0)
 
