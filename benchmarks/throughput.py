@@ -5,9 +5,10 @@
 
 Stages: `physics`, `render`, `physics+render`, `act` (the network on one observation of every
 environment), `learn` (one update: sampling, drawing and the gradient step) and `train` (the whole
-loop). Each figure is the median of repeated chunks after a warm-up, with the least and the most
-beside it; memory is that of a run, at its peak, beside the plan that it prints. With `--json` rows
-are written as they come, and a log-log plot next to the file.
+loop). Each figure is the median of repeated chunks after a warm-up, and with `--rounds` of those
+medians, with the least and the most of all chunks beside it; memory is that of a run, at its peak,
+beside the plan that it prints. With `--json` rows are written as they come, and a log-log plot next
+to the file.
 """
 
 from __future__ import annotations
@@ -338,6 +339,25 @@ def describe(env: mjx_arm.Env) -> dict[str, Any]:
     }
 
 
+def merge(done: list[dict[str, Any]], row: dict[str, Any]) -> None:
+    """Adds a row, to the earlier rounds of the same figure where there are any.
+
+    A machine that is shared changes its speed from minute to minute: the median of the rounds
+    counts, and their medians are kept beside it.
+    """
+    names = {"steps_per_s", "least", "most", "compile_s", "planned_bytes", "peak_bytes", "rounds"}
+    what = {name: value for name, value in row.items() if name not in names}
+    row["rounds"] = [row["steps_per_s"]]
+    for old in done:
+        if what.items() <= old.items():
+            old["rounds"] += row["rounds"]
+            old["steps_per_s"] = round(statistics.median(old["rounds"]))
+            old["least"] = min(old["least"], row["least"])
+            old["most"] = max(old["most"], row["most"])
+            return
+    done.append(row)
+
+
 def memory(row: dict[str, Any]) -> str:
     """What the table says of the memory of a row."""
     if "peak_bytes" not in row:
@@ -376,6 +396,7 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--gpu", action="store_true", help="MJX and MJX-Warp on NVIDIA, 10 minutes")
     parser.add_argument("--batch-size", type=int, help="of an update")
     parser.add_argument("--minutes", type=float, help="begin no figure after that")
+    parser.add_argument("--rounds", type=int, default=1, help="of all figures, one after another")
     parser.add_argument("--work", type=int, default=8192, help="environment steps of a timed chunk")
     parser.add_argument("--physics", nargs="+", choices=BACKENDS, help="backends")
     parser.add_argument("--stages", nargs="+", choices=STAGES, default=STAGES)
@@ -416,14 +437,14 @@ def main() -> None:
         end="",
     )
     print(f"{'least':>9}{'most':>9}{'compile s':>11}   memory at its peak, of the plan")
-    for row in rows(options):
-        done.append(row)
+    for row in itertools.chain.from_iterable(rows(options) for _ in range(options.rounds)):
         print(
             f"{row['stage']:<16}{row.get('storage', ''):<9}{row['shadows']!s:<9}"
             f"{row['num_envs']:>6}{row['backend']:>10}{row['steps_per_s']:>12,}{row['least']:>9,}{row['most']:>9,}"
             f"{row['compile_s']:>11}{memory(row)}",
             flush=True,
         )
+        merge(done, row)
         if options.json:
             options.json.parent.mkdir(parents=True, exist_ok=True)
             report = {"machine": machine(), "rows": done}
