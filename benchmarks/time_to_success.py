@@ -120,7 +120,7 @@ LEARNERS: dict[str, tuple[Callable[[TrainConfig, int], DQN], bool]] = {
 def make_envs(config: TrainConfig, num_envs: int, **changes: Any) -> ArmCubeVecEnv:
     """Our environments with the reward and the length of episodes of a run."""
     reward = RewardConfig(kind=config.reward, scale=config.reward_scale, discount=config.gamma)
-    options = {"reward": reward, "max_steps": config.max_steps} | changes
+    options = {"reward": reward, "max_steps": config.max_steps, "size": config.size} | changes
     return ArmCubeVecEnv(config.env, num_envs, physics="native", **options)
 
 

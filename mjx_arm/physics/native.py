@@ -209,7 +209,7 @@ def make_native(mj_model: mujoco.MjModel, substeps: int) -> Physics:
 
 
 def _num_threads(simulations: int) -> int:
-    """Threads beyond one per simulation would only be woken for nothing."""
+    """Threads of a Batch; beyond one per simulation they would only be woken for nothing."""
     return min(simulations, os.cpu_count() or 1)
 
 
