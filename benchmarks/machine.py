@@ -10,6 +10,8 @@ from typing import Any
 import jax
 import mujoco
 
+from mjx_arm.cores import usable_cores
+
 
 def machine() -> dict[str, Any]:
     """Processor, device and versions."""
@@ -20,7 +22,7 @@ def machine() -> dict[str, Any]:
         name = next((x.split(":")[1].strip() for x in lines if x.startswith("model name")), name)
     return {
         "cpu": name,
-        "cores": os.cpu_count(),
+        "cores": usable_cores(),
         "device": jax.devices()[0].device_kind,
         "python": platform.python_version(),
         "jax": jax.__version__,

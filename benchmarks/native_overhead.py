@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import pathlib
 import time
 from collections.abc import Callable
@@ -23,6 +22,7 @@ import numpy as np
 from machine import machine
 from mujoco import batch as mj_batch
 
+from mjx_arm.cores import usable_cores
 from mjx_arm.physics import Physics, make_physics
 from mjx_arm.scene import Scene, load_scene, resolve_task
 
@@ -51,7 +51,7 @@ def make_backend(physics: Physics, scene: Scene, num_envs: int, length: int) -> 
 def make_loop(physics: Physics, scene: Scene, num_envs: int, length: int) -> Callable[[], None]:
     """Returns a function that runs `length` iterations of the plain loop."""
     ids = resolve_task(scene)
-    batch = mj_batch.Batch(scene.mj_model, num_envs, nthread=min(num_envs, os.cpu_count() or 1))
+    batch = mj_batch.Batch(scene.mj_model, num_envs, nthread=min(num_envs, usable_cores()))
     batch.reset()
     ctrl = np.tile(ids.home_ctrl, (num_envs, 1))
     derived = [batch.bind(name) for name in ("geom_xpos", "geom_xmat", "site_xpos")]

@@ -40,6 +40,7 @@ from torch import nn
 
 import mjx_arm
 from mjx_arm.config import TrainConfig
+from mjx_arm.cores import usable_cores
 from mjx_arm.interop import ArmCubeEnv
 from mjx_arm.loop import make_body, make_trainer
 from mjx_arm.physics import compiler_options
@@ -149,7 +150,7 @@ def renderer_env(cheap: bool) -> Callable[[], float]:
 
 def bare_batch() -> Callable[[], float]:
     """Environment steps a second of MuJoCo's thread pool alone."""
-    batch = mj_batch.Batch(_SCENE.mj_model, _NUM_ENVS, nthread=os.cpu_count() or 1)
+    batch = mj_batch.Batch(_SCENE.mj_model, _NUM_ENVS, nthread=usable_cores())
     batch.reset()
     batch.bind("qpos")[:] = _IDS.home_qpos
     batch.ctrl[:] = _IDS.home_ctrl

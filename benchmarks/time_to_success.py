@@ -8,6 +8,12 @@ the best of ours (our network, 64 of our environments in one call, our reward, e
 returns and averaged target, which also is what is judged), once with its defaults on one of our
 environments, and is judged as often and in the same way. Both take hours: with `--keep FOLDER` they
 are saved at every judgement, which their time does not count, and the same command goes on.
+
+On a machine with two cores each learner may have one, and two of them run side by side:
+
+    taskset -c 0 make train
+    taskset -c 1 .venv-peers/bin/python benchmarks/time_to_success.py runs/NAME --threads 1 \\
+        --learners "sb3, defaults" --minutes 300 --json FILE
 """
 
 from __future__ import annotations
@@ -277,26 +283,30 @@ def main() -> None:
     if options.threads:
         torch.set_num_threads(options.threads)
     ours = our_time(options.run)
+    config = load_config(options.run)
     if options.minutes is None and ours["reached"] is None:
         parser.error(f"{options.run} never reached {_GOAL:.0%}: give --minutes")
     minutes = options.minutes or 5 * ours["reached"]["minutes"]
-    # One learner at a time may be asked for: the results of the others stay.
-    results = {}
-    if options.json and options.json.is_file():
-        results = {row["learner"]: row for row in json.loads(options.json.read_text())["results"]}
-    results["mjx_arm"] = ours
 
     def write(result: dict[str, Any]) -> None:
-        results[result["learner"]] = result
-        if options.json:
-            about = machine() | {"torch": torch.__version__, "threads": torch.get_num_threads()}
-            report = {"machine": about, "goal": _GOAL, "results": list(results.values())}
-            options.json.write_text(json.dumps(report, indent=1) + "\n")
+        if options.json is None:
+            return
+        # The other learner may be running beside this one, and so may ours.
+        results = {}
+        if options.json.is_file():
+            rows = json.loads(options.json.read_text())["results"]
+            results = {row["learner"]: row for row in rows}
+        results |= {"mjx_arm": our_time(options.run), result["learner"]: result}
+        about = machine() | {"torch": torch.__version__, "threads": torch.get_num_threads()}
+        report = {"machine": about, "goal": _GOAL, "results": list(results.values())}
+        part = options.json.with_suffix(".part")
+        part.write_text(json.dumps(report, indent=1) + "\n")
+        part.replace(options.json)
 
     print(f"mjx_arm: {_GOAL:.0%} after {ours['reached'] and ours['reached']['minutes']} minutes")
     for name in options.learners:
         keep = Keep(options.keep, name) if options.keep else None
-        their_time(name, load_config(options.run), minutes, keep, write)
+        their_time(name, config, minutes, keep, write)
 
 
 if __name__ == "__main__":

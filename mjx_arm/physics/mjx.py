@@ -15,6 +15,7 @@ import mujoco
 with contextlib.redirect_stdout(io.StringIO()):
     from mujoco import mjx
 
+from mjx_arm.cores import usable_cores
 from mjx_arm.kinematics import make_kinematics
 from mjx_arm.physics.base import Physics, PhysicsState
 
@@ -41,7 +42,7 @@ def _refuse_to_hang(mj_model: mujoco.MjModel) -> None:
         mj_model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_EULERDAMP
     )
     at_once = jax.local_device_count() * (2 if implicit else 1)
-    threads = int(os.environ.get("NPROC", os.cpu_count() or 1))
+    threads = int(os.environ.get("NPROC", usable_cores()))
     if 1 < threads <= at_once:
         raise ValueError(
             f"physics 'mjx' can hang on a CPU with {threads} threads and {at_once} matrix "

@@ -11,7 +11,6 @@ import contextlib
 import dataclasses
 import functools
 import math
-import os
 import threading
 from collections.abc import Callable, Iterator
 
@@ -22,6 +21,7 @@ import numpy as np
 from jax.experimental.buffer_callback import Buffer, buffer_callback
 from mujoco import batch as mj_batch
 
+from mjx_arm.cores import usable_cores
 from mjx_arm.kinematics import Poses, make_kinematics
 from mjx_arm.physics.base import Physics, PhysicsState
 from mjx_arm.physics.float_bits import float32_to_bits, float64_to_words
@@ -210,7 +210,7 @@ def make_native(mj_model: mujoco.MjModel, substeps: int) -> Physics:
 
 def _num_threads(simulations: int) -> int:
     """Threads of a Batch; beyond one per simulation they would only be woken for nothing."""
-    return min(simulations, os.cpu_count() or 1)
+    return min(simulations, usable_cores())
 
 
 def _call_host(
