@@ -9,11 +9,8 @@ returns and averaged target, which also is what is judged), once with its defaul
 environments, and is judged as often and in the same way. Both take hours: with `--keep FOLDER` they
 are saved at every judgement, which their time does not count, and the same command goes on.
 
-On a machine with two cores each learner may have one, and two of them run side by side:
-
-    taskset -c 0 make train
-    taskset -c 1 .venv-peers/bin/python benchmarks/time_to_success.py runs/NAME --threads 1 \\
-        --learners "sb3, defaults" --minutes 300 --json FILE
+Side by side, each on a core of its own (`taskset -c 0 make train`, `taskset -c 1 ... --threads 1`), ours
+and one of theirs share what else the machine does; results of several commands meet in one file.
 """
 
 from __future__ import annotations
