@@ -9,8 +9,8 @@ returns and averaged target, which also is what is judged), once with its defaul
 environments, and is judged as often and in the same way. Both take hours: with `--keep FOLDER` they
 are saved at every judgement, which their time does not count, and the same command goes on.
 
-Side by side, each on a core of its own (`taskset -c 0 make train`, `taskset -c 1 ... --threads 1`), ours
-and one of theirs share what else the machine does; results of several commands meet in one file.
+Side by side, each on a core of its own (`taskset -c 0 make train`, `taskset -c 1 ... --threads 1`),
+ours and one of theirs share what else the machine does; several commands write to one file.
 """
 
 from __future__ import annotations
