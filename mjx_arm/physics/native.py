@@ -8,21 +8,23 @@ is pure and its results are bit-identical to a plain `mj_step` loop.
 from __future__ import annotations
 
 import contextlib
+import copy
 import dataclasses
 import functools
+import hashlib
 import math
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from jax.experimental.buffer_callback import Buffer, buffer_callback
 from mujoco import batch as mj_batch
 
 from mjx_arm.cores import usable_cores
 from mjx_arm.kinematics import Poses, make_kinematics
+from mjx_arm.physics import host_call
 from mjx_arm.physics.base import Physics, PhysicsState
 from mjx_arm.physics.float_bits import float32_to_bits, float64_to_words
 
@@ -168,7 +170,11 @@ def make_native(mj_model: mujoco.MjModel, substeps: int) -> Physics:
     """
     kinematics = make_kinematics(mj_model)
     layout = _make_layout(mj_model)
-    step_rows = functools.partial(_step_rows, BatchPool(mj_model), layout, substeps=substeps)
+    # A copy: what is registered outlives this call, and may not change with the model.
+    pool = BatchPool(copy.copy(mj_model))
+    step_rows = functools.partial(_step_rows, pool, layout, substeps=substeps)
+    name = _name_of(mj_model, substeps)
+    host_call.register(name, step_rows)
     result = jax.ShapeDtypeStruct((layout.out_size,), jnp.uint32)
     nq, nv = mj_model.nq, mj_model.nv
 
@@ -185,7 +191,7 @@ def make_native(mj_model: mujoco.MjModel, substeps: int) -> Physics:
 
     def step(state: PhysicsState, ctrl: jax.Array) -> PhysicsState:
         ctrl_words = jax.lax.bitcast_convert_type(ctrl, jnp.uint32)
-        row = _call_host(step_rows, result, jnp.concatenate([state.integration, ctrl_words]))
+        row = _call_host(step_rows, name, result, jnp.concatenate([state.integration, ctrl_words]))
         words, observed, diverged = jnp.split(row, [layout.carried_words, layout.out_size - 1])
         observed = jax.lax.bitcast_convert_type(observed, jnp.float32)
         return PhysicsState(
@@ -214,32 +220,35 @@ def _num_threads(simulations: int) -> int:
 
 
 def _call_host(
-    function: Callable[[np.ndarray, np.ndarray], None],
-    result: jax.ShapeDtypeStruct,
-    rows: jax.Array,
+    function: host_call.HostFunction, name: str, result: jax.ShapeDtypeStruct, rows: jax.Array
 ) -> jax.Array:
     """Calls `function(rows, out)`, which fills `out`, with the rows of all environments at once.
 
-    On CPU the function works on XLA's own buffers: 4 us a call. `pure_callback` takes 65 us there,
-    since it puts its operands on a device again, from inside the running program.
+    On CPU the function works on XLA's own buffers, and is called by its name. `pure_callback` takes
+    65 us there, since it puts its operands on a device again, from inside the running program; and
+    every process compiles a program anew that holds one.
     """
-
-    def in_place(_: object, out: Buffer, rows: Buffer) -> None:
-        function(np.asarray(rows), np.asarray(out))
 
     def copied(rows: np.ndarray) -> np.ndarray:
         out = np.empty((*np.shape(rows)[:-1], *result.shape), result.dtype)
         function(np.asarray(rows), out)
         return out
 
-    how = "broadcast_all"
     returned = jax.lax.platform_dependent(
         rows,
-        cpu=buffer_callback(in_place, result, vmap_method=how),
-        default=lambda rows: jax.pure_callback(copied, result, rows, vmap_method=how),
+        cpu=lambda rows: host_call.call(name, rows, result),
+        default=lambda rows: jax.pure_callback(copied, result, rows, vmap_method="broadcast_all"),
     )
     # A callback forgets over which axes of a mesh its operands vary, which `shard_map` checks.
     return returned | (rows[0] & jnp.uint32(0))
+
+
+def _name_of(mj_model: mujoco.MjModel, substeps: int) -> str:
+    """What this model's steps are called in compiled programs, in every process."""
+    buffer = np.empty(mujoco.mj_sizeModel(mj_model), np.uint8)
+    mujoco.mj_saveModel(mj_model, None, buffer)
+    digest = hashlib.sha256(buffer.tobytes()).hexdigest()
+    return f"mjx_arm_step_{substeps}_{digest[:32]}"
 
 
 def _step_rows(

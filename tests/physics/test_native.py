@@ -87,7 +87,8 @@ def test_the_callback_is_handed_memory_and_no_jax_arrays(lab, monkeypatch):
         out[...] = 0
 
     monkeypatch.setattr(native, "_step_rows", spy)
-    physics = make_native(lab.scene.mj_model, lab.physics.substeps)
+    # One substep more: compiled programs call the last function of a model and number of substeps.
+    physics = make_native(lab.scene.mj_model, lab.physics.substeps + 1)
     qpos, ctrl = lab.home()
     jax.block_until_ready(jax.jit(jax.vmap(physics.step))(lab.init(qpos, ctrl), jnp.asarray(ctrl)))
     ((rows, shape, out, writeable),) = seen
