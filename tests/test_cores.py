@@ -10,6 +10,7 @@ import pytest
 
 CODE = """
 import os
+os.environ["JAX_PLATFORMS"] = "cpu"
 os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
 import jax
 jax.block_until_ready(jax.numpy.zeros(3) + 1)

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import ctypes
 import traceback
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, ClassVar
 
 import jax
 import numpy as np
@@ -21,14 +21,21 @@ _METADATA = 1
 _INTERNAL = 13
 
 
+class _Headed(ctypes.Structure):
+    """What nearly all of them begin with."""
+
+    _fields_: ClassVar[Sequence[tuple[str, Any]]] = (
+        ("size", ctypes.c_size_t),
+        ("extension", ctypes.c_void_p),
+    )
+
+
 class _Extension(ctypes.Structure):
     _fields_ = (("size", ctypes.c_size_t), ("type", ctypes.c_int), ("next", ctypes.c_void_p))
 
 
-class _Version(ctypes.Structure):
+class _Version(_Headed):
     _fields_ = (
-        ("size", ctypes.c_size_t),
-        ("extension", ctypes.c_void_p),
         ("major", ctypes.c_int),
         ("minor", ctypes.c_int),
     )
@@ -42,10 +49,8 @@ class _MetadataExtension(ctypes.Structure):
     _fields_ = (("base", _Extension), ("metadata", ctypes.POINTER(_Metadata)))
 
 
-class _Buffer(ctypes.Structure):
+class _Buffer(_Headed):
     _fields_ = (
-        ("size", ctypes.c_size_t),
-        ("extension", ctypes.c_void_p),
         ("dtype", ctypes.c_int),
         ("data", ctypes.c_void_p),
         ("rank", ctypes.c_int64),
@@ -53,20 +58,16 @@ class _Buffer(ctypes.Structure):
     )
 
 
-class _Buffers(ctypes.Structure):
+class _Buffers(_Headed):
     _fields_ = (
-        ("struct_size", ctypes.c_size_t),
-        ("extension", ctypes.c_void_p),
-        ("size", ctypes.c_int64),
+        ("count", ctypes.c_int64),
         ("types", ctypes.c_void_p),
         ("buffers", ctypes.POINTER(ctypes.POINTER(_Buffer))),
     )
 
 
-class _ErrorArguments(ctypes.Structure):
+class _ErrorArguments(_Headed):
     _fields_ = (
-        ("size", ctypes.c_size_t),
-        ("extension", ctypes.c_void_p),
         ("message", ctypes.c_char_p),
         ("code", ctypes.c_int),
     )
@@ -75,10 +76,8 @@ class _ErrorArguments(ctypes.Structure):
 _MakeError = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.POINTER(_ErrorArguments))
 
 
-class _Api(ctypes.Structure):
+class _Api(_Headed):
     _fields_ = (
-        ("size", ctypes.c_size_t),
-        ("extension", ctypes.c_void_p),
         ("version", _Version),
         ("internal", ctypes.c_void_p),
         ("make_error", _MakeError),
@@ -132,7 +131,16 @@ def register(name: str, function: HostFunction) -> None:
 
 
 def call(name: str, operand: jax.Array, result: jax.ShapeDtypeStruct) -> jax.Array:
-    """Calls a registered function; under vmap once with all rows."""
+    """Calls a registered function; under vmap once with all rows.
+
+    Args:
+      name: of the function.
+      operand: `[...] uint32`, what it reads.
+      result: shape of what it fills, uint32.
+
+    Returns:
+      What it filled. What it raises comes out of the program as an error of XLA.
+    """
     done: jax.Array = jax.ffi.ffi_call(name, result, vmap_method="broadcast_all")(operand)
     return done
 
@@ -147,7 +155,7 @@ def _describe(frame: _Frame) -> None:
 
 
 def _array(buffers: _Buffers) -> np.ndarray:
-    """The first of the buffers, which stays where it is."""
+    """The first of the buffers where it lies: `[...] uint32`."""
     buffer = buffers.buffers[0].contents
     shape = tuple(buffer.dims[: buffer.rank])
     size = int(np.prod(shape, dtype=np.int64))

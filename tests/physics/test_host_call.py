@@ -12,6 +12,10 @@ import pytest
 
 from mjx_arm.physics import host_call
 
+pytestmark = pytest.mark.skipif(
+    jax.default_backend() != "cpu", reason="only programs for the CPU call by name"
+)
+
 ROW = jax.ShapeDtypeStruct((3,), jnp.uint32)
 
 ONCE = """
@@ -32,9 +36,8 @@ print(hit, float(end.poses.site_xpos.sum()))
 """
 
 
-@pytest.mark.skipif(jax.default_backend() != "cpu", reason="the functions are called on the CPU")
 class TestCalls:
-    """Of a function that doubles."""
+    """Of small functions."""
 
     def test_one_call_has_all_rows(self):
         shapes = []
