@@ -9,6 +9,8 @@ returns and averaged target, which also is what is judged), once with its defaul
 environments, and is judged as often and in the same way. Both take hours: with `--keep FOLDER` they
 are saved at every judgement, which their time does not count, and the same command goes on.
 
+Without a run ours is what the file of results has from before, and theirs is added to it.
+
 Side by side, each on a core of its own (`taskset -c 0 make train`, `taskset -c 1 ... --threads 1`),
 ours and one of theirs share what else the machine does; several commands write to one file.
 """
@@ -270,7 +272,12 @@ def their_time(
 def main() -> None:
     """Reads our run, trains theirs, and writes the results as they come."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("run", type=pathlib.Path, help="a run folder of ours, in environment A")
+    parser.add_argument(
+        "run",
+        nargs="?",
+        type=pathlib.Path,
+        help="a run folder of ours; without one ours is what the file of results has",
+    )
     parser.add_argument("--learners", nargs="+", choices=LEARNERS, default=list(LEARNERS))
     parser.add_argument("--minutes", type=float, help="5 times ours where left out")
     parser.add_argument("--threads", type=int, help="of PyTorch; all cores where left out")
@@ -279,23 +286,35 @@ def main() -> None:
     options = parser.parse_args()
     if options.threads:
         torch.set_num_threads(options.threads)
-    ours = our_time(options.run)
-    config = load_config(options.run)
+    if options.run is None and not (options.json and options.json.is_file()):
+        parser.error("no run is given, and no file of results that has one: give a run folder")
+
+    about = machine() | {"torch": torch.__version__, "threads": torch.get_num_threads()}
+
+    def read() -> dict[str, dict[str, Any]]:
+        # Again each time: the other learner may be running beside this one, and so may ours.
+        results = {}
+        if options.json is not None and options.json.is_file():
+            rows = json.loads(options.json.read_text())["results"]
+            results = {row["learner"]: row for row in rows}
+        if options.run is not None:
+            results["mjx_arm"] = our_time(options.run) | {"machine": about}
+        return results
+
+    try:
+        ours = read()["mjx_arm"]
+        config = TrainConfig() if options.run is None else load_config(options.run)
+    except ValueError as error:
+        parser.error(str(error))
     if options.minutes is None and ours["reached"] is None:
-        parser.error(f"{options.run} never reached {_GOAL:.0%}: give --minutes")
+        parser.error(f"ours never reached {_GOAL:.0%}: give --minutes")
     minutes = options.minutes or 5 * ours["reached"]["minutes"]
 
     def write(result: dict[str, Any]) -> None:
         if options.json is None:
             return
-        # The other learner may be running beside this one, and so may ours.
-        results = {}
-        if options.json.is_file():
-            rows = json.loads(options.json.read_text())["results"]
-            results = {row["learner"]: row for row in rows}
-        results |= {"mjx_arm": our_time(options.run), result["learner"]: result}
-        about = machine() | {"torch": torch.__version__, "threads": torch.get_num_threads()}
-        report = {"machine": about, "goal": _GOAL, "results": list(results.values())}
+        results = read() | {result["learner"]: result | {"machine": about}}
+        report = {"goal": _GOAL, "results": list(results.values())}
         part = options.json.with_suffix(".part")
         part.write_text(json.dumps(report, indent=1) + "\n")
         part.replace(options.json)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import contextlib
 import dataclasses
-import datetime
 import io
 import itertools
 import json
@@ -53,10 +52,8 @@ class Train:
         if self.resume is not None:
             self._resume(self.resume, given)
             return
-        now = datetime.datetime.now().strftime("%Y-%m-%d-%H%M%S")
-        folder = self.out or pathlib.Path("runs") / f"{now}-{self.config.env}"
         console = Console(highlight=False)
-        train(self.config, folder, eval_episodes=self.eval_episodes, console=console)
+        train(self.config, self.out, eval_episodes=self.eval_episodes, console=console)
 
     def _resume(self, folder: pathlib.Path, given: frozenset[str]) -> None:
         saved = load_config(folder)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import datetime
 import json
 import math
 import os
@@ -62,7 +63,7 @@ class RunInterruptedError(Exception):
 
 
 def train(
-    config: TrainConfig, folder: pathlib.Path, *, eval_episodes: int, console: Console
+    config: TrainConfig, folder: pathlib.Path | None, *, eval_episodes: int, console: Console
 ) -> list[Evaluation]:
     """Trains an agent and leaves metrics, curves, agents, an evaluation and a video.
 
@@ -70,7 +71,8 @@ def train(
 
     Args:
       config: the options.
-      folder: the run folder; made, must be new or empty.
+      folder: the run folder; made, must be new or empty. None for a new one in `runs`, named by
+        the time.
       eval_episodes: episodes of the evaluation at the end.
       console: where it speaks.
 
@@ -83,7 +85,7 @@ def train(
     """
     _check_episodes(eval_episodes)
     trainer = _prepare(config, console)
-    prepare_folder(folder)
+    folder = new_run_folder(config.env) if folder is None else prepare_folder(folder)
     run_chunk = _compile(trainer, console)
     # With the backend by name: where a run goes on, "auto" may mean another, with other states.
     config = dataclasses.replace(config, physics=trainer.env.physics.backend)
@@ -392,8 +394,31 @@ def _finish_seed(folder: pathlib.Path, eval_episodes: int, console: Console) -> 
     return result
 
 
-def prepare_folder(folder: pathlib.Path) -> None:
-    """Makes the run folder.
+def new_run_folder(env: str) -> pathlib.Path:
+    """Makes a folder in `runs`, named by the time, and with a number where that name is taken.
+
+    Raises:
+      ValueError: it cannot be made.
+    """
+    runs, name = pathlib.Path("runs"), f"{datetime.datetime.now():%Y-%m-%d-%H%M%S}-{env}"
+    folder, number = runs / name, 1
+    try:
+        runs.mkdir(exist_ok=True)
+        while True:
+            # Not `exist_ok`: runs that a cluster starts in one second must not share a folder.
+            with contextlib.suppress(FileExistsError):
+                folder.mkdir()
+                return folder
+            number += 1
+            folder = runs / f"{name}-{number}"
+    except OSError as error:
+        raise ValueError(
+            f"{folder} cannot be made ({error.strerror}): give --out another folder"
+        ) from error
+
+
+def prepare_folder(folder: pathlib.Path) -> pathlib.Path:
+    """Makes the run folder, and returns it.
 
     Raises:
       ValueError: it is a file, holds something already, or cannot be written.
@@ -411,3 +436,4 @@ def prepare_folder(folder: pathlib.Path) -> None:
         raise ValueError(f"{folder} cannot be written: give --out another folder")
     if occupied:
         raise ValueError(f"{folder} is not empty: give --out a new or empty folder")
+    return folder

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import concurrent.futures
 import dataclasses
 import json
 import pathlib
@@ -17,6 +18,7 @@ from mjx_arm.agent import load_agent, load_config, save_config
 from mjx_arm.cli import main
 from mjx_arm.config import PRESETS, TrainConfig
 from mjx_arm.report.metrics import read_metrics
+from mjx_arm.train import new_run_folder
 
 TINY = [
     *("--physics", "native", "--num-envs", "4", "--size", "16", "16", "--replay-size", "400"),
@@ -46,6 +48,21 @@ def test_a_run_leaves_everything(run_folder):
     assert json.loads((run_folder / "evaluation.json").read_text())["episodes"] == 6
     config = load_config(run_folder)
     assert (config.total_steps, config.physics) == (400, "native")
+
+
+def test_runs_that_start_in_the_same_second_have_folders_of_their_own(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with concurrent.futures.ThreadPoolExecutor(8) as pool:
+        folders = list(pool.map(new_run_folder, ["A"] * 24))
+    assert len(set(folders)) == 24
+    assert {path.parent for path in folders} == {pathlib.Path("runs")}
+
+
+def test_no_folder_for_a_run_is_a_sentence(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "runs").write_text("")
+    with pytest.raises(ValueError, match=r"runs.* cannot be made .*: give --out another folder"):
+        new_run_folder("A")
 
 
 def read_video(path: pathlib.Path) -> np.ndarray:
