@@ -286,9 +286,6 @@ def main() -> None:
     options = parser.parse_args()
     if options.threads:
         torch.set_num_threads(options.threads)
-    if options.run is None and not (options.json and options.json.is_file()):
-        parser.error("no run is given, and no file of results that has one: give a run folder")
-
     about = machine() | {"torch": torch.__version__, "threads": torch.get_num_threads()}
 
     def read() -> dict[str, dict[str, Any]]:
@@ -302,10 +299,12 @@ def main() -> None:
         return results
 
     try:
-        ours = read()["mjx_arm"]
+        ours = read().get("mjx_arm")
         config = TrainConfig() if options.run is None else load_config(options.run)
     except ValueError as error:
         parser.error(str(error))
+    if ours is None:
+        parser.error("no run is given, and no file of results that has one: give a run folder")
     if options.minutes is None and ours["reached"] is None:
         parser.error(f"ours never reached {_GOAL:.0%}: give --minutes")
     minutes = options.minutes or 5 * ours["reached"]["minutes"]

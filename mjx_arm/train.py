@@ -412,9 +412,11 @@ def new_run_folder(env: str) -> pathlib.Path:
             number += 1
             folder = runs / f"{name}-{number}"
     except OSError as error:
-        raise ValueError(
-            f"{folder} cannot be made ({error.strerror}): give --out another folder"
-        ) from error
+        raise _cannot_be_made(folder, error) from error
+
+
+def _cannot_be_made(folder: pathlib.Path, error: OSError) -> ValueError:
+    return ValueError(f"{folder} cannot be made ({error.strerror}): give --out another folder")
 
 
 def prepare_folder(folder: pathlib.Path) -> pathlib.Path:
@@ -429,9 +431,7 @@ def prepare_folder(folder: pathlib.Path) -> pathlib.Path:
     except (FileExistsError, NotADirectoryError) as error:
         raise ValueError(f"{folder} is a file: give --out a new or empty folder") from error
     except OSError as error:
-        raise ValueError(
-            f"{folder} cannot be made ({error.strerror}): give --out another folder"
-        ) from error
+        raise _cannot_be_made(folder, error) from error
     if not os.access(folder, os.W_OK | os.X_OK):
         raise ValueError(f"{folder} cannot be written: give --out another folder")
     if occupied:

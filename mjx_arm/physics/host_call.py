@@ -107,8 +107,8 @@ def register(name: str, function: HostFunction) -> None:
 
     Args:
       name: of the function; the same in every process that is to share compiled programs.
-      function: `function(operand, result)`, reads one array and fills the other, both uint32 and in
-        XLA's own memory. Called from several threads at once.
+      function: `function(operand, result)`, reads the one and fills the other, `[..., K]` and
+        `[..., L]` uint32 in XLA's own memory. Called from several threads at once.
     """
     _functions[name] = function
     if name in _handlers:
