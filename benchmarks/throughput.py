@@ -38,7 +38,7 @@ from matplotlib.figure import Figure
 
 import mjx_arm
 from mjx_arm.config import BACKENDS
-from mjx_arm.loop import Trainer, make_body, make_trainer
+from mjx_arm.loop import make_body, make_trainer
 from mjx_arm.memory import memory_plan, working_memory
 from mjx_arm.parts import in_parts, overwrite_in_parts
 from mjx_arm.physics import compiler_options
@@ -50,16 +50,6 @@ _SUMS = ("physics+render", "train")
 NUM_ENVS = (16, 64, 256, 1024, 4096, 16384)
 # Updates of one timed chunk, at least.
 _UPDATES = 8
-
-
-def compile_chunk(
-    run: Callable[[Any], Any], state: Any, options: Any, *, donate: bool
-) -> tuple[jax.stages.Compiled, float]:
-    """The compiled chunk, for a state or its shapes, and the seconds that it took."""
-    started = time.perf_counter()
-    jitted = jax.jit(run, donate_argnums=0 if donate else (), compiler_options=options)
-    compiled = jitted.lower(state).compile()
-    return compiled, round(time.perf_counter() - started, 2)
 
 
 def time_chunks(run: Callable[[], Any], work: int, repeats: int) -> dict[str, int]:
@@ -78,34 +68,58 @@ def time_stage(
     run: Callable[[Any], Any], state: Any, work: int, repeats: int, options: Any
 ) -> dict[str, float]:
     """Rates and compile time of a stage that leaves its state as it is."""
-    compiled, compile_s = compile_chunk(run, state, options, donate=False)
+    started = time.perf_counter()
+    compiled = jax.jit(run, compiler_options=options).lower(state).compile()
+    compile_s = round(time.perf_counter() - started, 2)
     return time_chunks(lambda: compiled(state), work, repeats) | {"compile_s": compile_s}
 
 
-def peak_memory(config: mjx_arm.TrainConfig) -> dict[str, int]:
-    """Bytes that training comes to hold beyond what the process held once it was compiled.
+@dataclasses.dataclass(frozen=True)
+class Training:
+    """A training run that is compiled, and what is known of it by then."""
 
-    On CPU by what of the heap is in use, looked at every millisecond; elsewhere by the device's own
-    count.
-    """
+    config: mjx_arm.TrainConfig
+    init: jax.stages.Compiled
+    run_chunk: jax.stages.Compiled
+    compile_s: float
+    planned_bytes: int
+
+
+def compile_training(config: mjx_arm.TrainConfig) -> Training:
+    """Compiles what a training run calls."""
     trainer = make_trainer(config)
     key = jax.random.key(0)
     shapes = jax.eval_shape(trainer.init, key)
-    init, run = trainer.init.lower(key).compile(), trainer.run_chunk.lower(shapes).compile()
+    init = trainer.init.lower(key).compile()
+    started = time.perf_counter()
+    run = trainer.run_chunk.lower(shapes).compile()
+    compile_s = round(time.perf_counter() - started, 2)
     working = working_memory(run, trainer.env.physics, config.num_envs)
     planned = sum(memory_plan(shapes).values()) + working
+    return Training(config, init, run, compile_s, planned)
+
+
+def peak_memory(training: Training) -> dict[str, int]:
+    """Bytes that training comes to hold beyond what the process held once it was compiled.
+
+    On CPU by what of the heap is in use, looked at every millisecond; elsewhere by the device's own
+    count, which never forgets: after a figure that took more there is none.
+    """
     gc.collect()
 
     def train() -> None:
-        state = init(key)
+        state = training.init(jax.random.key(0))
         for _ in range(2):
             # As training does; else the second gets its own room while the first is at work.
-            state, _ = jax.block_until_ready(run(state))
+            state, _ = jax.block_until_ready(training.run_chunk(state))
 
-    grown = heap_growth(train)
-    stats = jax.devices()[0].memory_stats()
-    peak = stats["peak_bytes_in_use"] if stats else grown
-    return {"planned_bytes": planned} | ({} if peak is None else {"peak_bytes": peak})
+    before = jax.devices()[0].memory_stats()
+    peak = heap_growth(train)
+    after = jax.devices()[0].memory_stats()
+    if before and after:
+        highest, was = after["peak_bytes_in_use"], before["peak_bytes_in_use"]
+        peak = highest - before["bytes_in_use"] if highest > was else None
+    return {} if peak is None else {"peak_bytes": peak}
 
 
 class _Mallinfo2(ctypes.Structure):
@@ -154,12 +168,14 @@ def heap_growth(run: Callable[[], Any]) -> int | None:
 
 
 def peak_memory_apart(config: mjx_arm.TrainConfig) -> dict[str, int]:
-    """The same in a process of its own on CPU, whose heap nothing else uses."""
-    if jax.default_backend() != "cpu":
-        return peak_memory(config)
+    """The same in a process of its own, whose heap nothing else uses."""
     spawn = multiprocessing.get_context("spawn")
     with concurrent.futures.ProcessPoolExecutor(1, mp_context=spawn) as pool:
-        return pool.submit(peak_memory, config).result()
+        return pool.submit(_compiled_peak_memory, config).result()
+
+
+def _compiled_peak_memory(config: mjx_arm.TrainConfig) -> dict[str, int]:
+    return peak_memory(compile_training(config))
 
 
 def env_stages(env: mjx_arm.Env, num_envs: int, length: int) -> dict[str, Callable[[Any], Any]]:
@@ -180,7 +196,8 @@ def env_stages(env: mjx_arm.Env, num_envs: int, length: int) -> dict[str, Callab
             physics = state.env.physics
             poses = physics.poses.replace(geom_xpos=physics.poses.geom_xpos + shift)
             moved = state.replace(env=state.env.replace(physics=physics.replace(poses=poses)))
-            return state, draw(env, moved)[:, 0, 0]
+            # All pixels count, or a GPU would draw those alone that do.
+            return state, jnp.sum(draw(env, moved) & 1, axis=(1, 2))
 
         return jax.lax.scan(once, carry[0], 1e-6 * jnp.arange(length, dtype=jnp.float32))
 
@@ -281,7 +298,7 @@ def agent_rows(
             batch_size=options.batch_size,
             storage=storage,
             # Enough for the longest chunk; pixels of more would not fit everywhere.
-            replay_size=max(20_000, 8 * num_envs) if storage == "pixels" else 200_000,
+            replay_size=max(20_000 if storage == "pixels" else 200_000, 8 * num_envs),
             learning_starts=0,
             chunk_steps=num_envs * length,
         )
@@ -293,9 +310,10 @@ def agent_rows(
         named = {**describe(trainer.env), **common, "storage": storage}
         named["batch_size"] = config.batch_size
         if "train" in options.stages:
-            # Memory first: an accelerator's count starts with the process.
-            memory = peak_memory_apart(config)
-            yield {"stage": "train", **named, **time_training(trainer, repeats), **memory}
+            training = compile_training(config)
+            on_cpu = jax.default_backend() == "cpu"
+            memory = peak_memory_apart(config) if on_cpu else peak_memory(training)
+            yield {"stage": "train", **named, **time_training(training, repeats), **memory}
         if {"act", "learn"} & set(options.stages):
             state = trainer.init(jax.random.key(0))
             for stage, run in agent_stages(config, length).items():
@@ -306,17 +324,14 @@ def agent_rows(
                     yield {"stage": stage, **named, **figures}
 
 
-def time_training(trainer: Trainer, repeats: int) -> dict[str, float]:
+def time_training(training: Training, repeats: int) -> dict[str, float]:
     """Rates of the whole loop."""
-    config = trainer.config
-    shapes = jax.eval_shape(trainer.init, jax.random.key(0))
-    flags = compiler_options(trainer.env.physics)
-    compiled, compile_s = compile_chunk(make_body(config).run_chunk, shapes, flags, donate=True)
+    config = training.config
     # The state of one chunk is the next one's.
-    state = [trainer.init(jax.random.key(0))]
+    state = [training.init(jax.random.key(0))]
 
     def run() -> Any:
-        state[0], counts = compiled(state[0])
+        state[0], counts = training.run_chunk(state[0])
         return counts
 
     # Once more, for the replay must fill before the first update.
@@ -325,7 +340,8 @@ def time_training(trainer: Trainer, repeats: int) -> dict[str, float]:
     return {
         "samples_per_step": config.updates_per_step * config.batch_size / config.num_envs,
         **figures,
-        "compile_s": compile_s,
+        "compile_s": training.compile_s,
+        "planned_bytes": training.planned_bytes,
     }
 
 
@@ -411,7 +427,8 @@ def parse() -> argparse.Namespace:
             parser.error(f"--gpu needs an NVIDIA GPU, and jax runs on {jax.default_backend()}")
         options.num_envs = options.num_envs or [8192, 1024]
         options.physics = options.physics or _gpu_backends()
-        options.minutes = options.minutes or 9.0
+        # A figure that begins then compiles for a minute or two.
+        options.minutes = options.minutes or 7.0
         options.work = max(options.work, 131_072)
         options.batch_size = options.batch_size or 1024
     options.physics = options.physics or ["auto"]

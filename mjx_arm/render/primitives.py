@@ -208,7 +208,8 @@ def sphere_coefficients(size: jax.Array, sight: Sight) -> Sphere:
     return Sphere(
         towards=jnp.where(outside, towards, jnp.zeros_like(towards).at[2].set(-1.0)),
         across=matmul(perpendicular(axis), sight.basis) / jnp.sqrt(power),
-        shrink=radius / distance,
+        # From inside no ray meets it.
+        shrink=jnp.where(outside, radius / distance, 0.0),
         offset=matvec(sight.lights, sight.origin) / radius,
         curvature=1 / radius,
     )
@@ -267,7 +268,10 @@ def _make_tube(radius: jax.Array, sight: Sight) -> Tube:
 
 
 class _TubeHit(NamedTuple):
-    """Entry into a tube, each `[H, W]`: square of the root, `w`, and the tube's two forms."""
+    """Entry into a tube, each `[H, W]`: square of the root, `w`, and the tube's two forms.
+
+    From inside `w` is negative, so that no ray is taken to enter.
+    """
 
     root2: jax.Array
     w: jax.Array
@@ -291,7 +295,7 @@ class Cylinder(NamedTuple):
       tube: the side.
       axial: `[3]`, form of the direction along the axis.
       height: `[]`, the camera's height along the axis, m.
-      reach: `[]`, half length, m; or -1 where the camera is inside of the tube and sees no side.
+      half: `[]`, half length, m.
       cap: `[]`, `w` at the cap on the camera's side over `axial`, 1/m; 0 where it sees no cap.
       offset: `[L]`, the camera's offset from the axis along the lights, over the radius.
       direction: `[L, 3]`, forms of the direction off the axis along the lights, over the radius.
@@ -301,7 +305,7 @@ class Cylinder(NamedTuple):
     tube: Tube
     axial: jax.Array
     height: jax.Array
-    reach: jax.Array
+    half: jax.Array
     cap: jax.Array
     offset: jax.Array
     direction: jax.Array
@@ -318,7 +322,7 @@ def cylinder_coefficients(size: jax.Array, sight: Sight) -> Cylinder:
         tube=tube,
         axial=sight.basis[2],
         height=height,
-        reach=jnp.where(tube.power > 0, half, -1.0),
+        half=half,
         cap=jnp.where(gap > _TINY, -sign(height) / greater(gap, jnp.full_like(gap, _TINY)), 0.0),
         offset=matvec(sight.lights[:, :2], sight.origin[:2]) / radius,
         direction=matmul(sight.lights[:, :2], sight.basis[:2]) / radius,
@@ -332,7 +336,7 @@ def cylinder_hit(cylinder: Cylinder, rays: Rays) -> Hit:
     side = _enter_tube(tube, rays)
     axial = affine(cylinder.axial, rays.u, rays.v)
     rise = cylinder.height * side.w + axial
-    on_side = (side.root2 >= 0) & (jnp.abs(rise) <= cylinder.reach * side.w)
+    on_side = (side.root2 >= 0) & (jnp.abs(rise) <= cylinder.half * side.w)
     w_cap = cylinder.cap * axial
     run = tube.distance * w_cap + side.away
     on_cap = run * run + side.across2 <= tube.radius2 * (w_cap * w_cap)
@@ -356,7 +360,6 @@ class Capsule(NamedTuple):
       axial: `[3]`, form of the direction along the axis.
       height: `[]`, the camera's height along the axis, m.
       half: `[]`, half length of the straight part, m.
-      reach: `[]`, `half`; or -1 where the camera is inside of the tube and sees no side.
       beyond: `[]`, added to the tube's height to choose the end: 0; or plus or minus huge where
         the camera is inside of the tube and sees only the end on its own side.
       towards: `[3]`, form of the direction along the offset to the centre, m.
@@ -371,7 +374,6 @@ class Capsule(NamedTuple):
     axial: jax.Array
     height: jax.Array
     half: jax.Array
-    reach: jax.Array
     beyond: jax.Array
     towards: jax.Array
     power: jax.Array
@@ -397,7 +399,6 @@ def capsule_coefficients(size: jax.Array, sight: Sight) -> Capsule:
         axial=sight.basis[2],
         height=height,
         half=half,
-        reach=jnp.where(outside, half, -1.0),
         beyond=jnp.where(outside, 0.0, sign(height) * _HUGE),
         towards=jnp.where(around, 0.0, -matvec(sight.basis.T, sight.origin)),
         power=power,
@@ -413,7 +414,7 @@ def capsule_hit(capsule: Capsule, rays: Rays) -> Hit:
     side = _enter_tube(capsule.tube, rays)
     axial = affine(capsule.axial, rays.u, rays.v)
     rise = capsule.height * side.w + axial
-    on_side = jnp.abs(rise) <= capsule.reach * side.w
+    on_side = jnp.abs(rise) <= capsule.half * side.w
     w_end, end_root2 = _capsule_end(capsule, rise + capsule.beyond > 0, axial, rays)
     w = jnp.where(on_side, side.w, w_end)
     hit = (side.root2 >= 0) & (on_side | (end_root2 >= 0))

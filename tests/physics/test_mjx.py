@@ -91,6 +91,16 @@ def test_importing_mjx_prints_nothing():
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
 
 
+def test_products_keep_all_bits(scene, ids):
+    """On a GPU jax would else take 10 bits of what is multiplied."""
+    physics = make_physics(scene, "mjx")
+    state = physics.init(jnp.asarray(ids.home_qpos), jnp.asarray(ids.home_ctrl))
+    program = jax.jit(physics.step).lower(state, jnp.asarray(ids.home_ctrl)).as_text()
+    products = [line for line in program.splitlines() if "dot_general" in line]
+    assert len(products) > 10
+    assert all("HIGHEST, HIGHEST" in line for line in products)
+
+
 @pytest.mark.skipif(not WITHOUT_WARP, reason="the extra 'warp' is installed")
 def test_mjx_warp_without_its_extra_is_refused(scene):
     with pytest.raises(ValueError, match=r"needs the extra 'warp': pip install 'mjx-arm\[warp\]'"):

@@ -132,10 +132,27 @@ def test_a_geom_around_the_camera_is_not_drawn(shape: str) -> None:
     assert np.all(_look(scene, pos, mat)[1] == -1)
 
 
+def test_a_dome_around_the_scene_is_not_drawn() -> None:
+    scene = scene_of("""
+<mujoco>
+  <worldbody>
+    <camera name="front" pos="0 0 0"/>
+    <geom type="sphere" size="5"/>
+    <geom type="sphere" size="0.1" pos="1 0 0"/>
+  </worldbody>
+</mujoco>""")
+    pos = np.asarray([[0.0, 0.0, 0.0], [0.5, 0.3, -0.2], [-4.0, 0.0, 0.0]])
+    mat = _looking_at(pos, np.asarray([[1.0, 0.0, 0.0]]), np.random.default_rng(0))
+    geom = _look(scene, pos, mat)[1]
+    assert not np.any(geom == 0)
+    assert np.all(np.any(geom == 1, axis=(1, 2)))
+
+
 @pytest.mark.parametrize("shape", SHAPES)
-def test_camera_on_the_axes_of_symmetry(shape: str) -> None:
+@pytest.mark.parametrize("distance", [0.35, 0.5, 0.7, 3.0])
+def test_camera_on_the_axes_of_symmetry(shape: str, distance: float) -> None:
     scene = _one_geom(shape)
-    pos = 0.7 * np.concatenate([np.eye(3), -np.eye(3)])
+    pos = distance * np.concatenate([np.eye(3), -np.eye(3)])
     _assert_same(scene, pos, _looking_at(pos, np.zeros((6, 3)), np.random.default_rng(7)))
 
 
