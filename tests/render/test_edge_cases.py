@@ -141,7 +141,7 @@ def test_a_dome_around_the_scene_is_not_drawn() -> None:
     <geom type="sphere" size="0.1" pos="1 0 0"/>
   </worldbody>
 </mujoco>""")
-    pos = np.asarray([[0.0, 0.0, 0.0], [0.5, 0.3, -0.2], [-4.0, 0.0, 0.0]])
+    pos = np.asarray([[0.0, 0.0, 0.0], [0.5, 0.3, -0.2], [-2.0, 0.0, 0.0]])
     mat = _looking_at(pos, np.asarray([[1.0, 0.0, 0.0]]), np.random.default_rng(0))
     geom = _look(scene, pos, mat)[1]
     assert not np.any(geom == 0)
