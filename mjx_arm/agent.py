@@ -17,7 +17,7 @@ from mjx_arm.dqn import DQN, epsilon_greedy
 from mjx_arm.env import Env, make_env
 from mjx_arm.loop import make_dqn
 
-_CONFIG = "config.json"
+CONFIG = "config.json"
 _FORMAT = "mjx_arm agent 1"
 LAST, BEST = "last.agent", "best.agent"
 
@@ -58,9 +58,9 @@ class Agent:
 
 def save_config(folder: pathlib.Path, config: TrainConfig) -> None:
     """Writes `config.json`: whole, or the one before stays."""
-    part = folder / f"{_CONFIG}.part"
+    part = folder / f"{CONFIG}.part"
     part.write_text(_dump_config(config) + "\n")
-    part.replace(folder / _CONFIG)
+    part.replace(folder / CONFIG)
 
 
 def load_config(folder: pathlib.Path) -> TrainConfig:
@@ -69,9 +69,9 @@ def load_config(folder: pathlib.Path) -> TrainConfig:
     Raises:
       ValueError: the folder holds no configuration of this version.
     """
-    path = folder / _CONFIG
+    path = folder / CONFIG
     if not path.is_file():
-        raise ValueError(f"{folder} is no run folder: it has no {_CONFIG}")
+        raise ValueError(f"{folder} is no run folder: it has no {CONFIG}")
     return _parse_config(path.read_text(), path)
 
 
@@ -161,7 +161,7 @@ def find_agent(path: pathlib.Path) -> pathlib.Path:
     for name in (BEST, LAST):
         if (path / name).is_file():
             return path / name
-    if (path / _CONFIG).is_file():
+    if (path / CONFIG).is_file():
         seeds = ", ".join(sorted(str(seed) for seed in path.glob("seed-*")))
         hint = f"give one of {seeds}" if seeds else "the run has not saved one yet"
         raise ValueError(f"{path} holds no agent: {hint}")

@@ -87,7 +87,7 @@ def load_tree(path: pathlib.Path, like: Any) -> Any:
     # A read that fails half-way leaves orbax with coroutines to complain of.
     check_tree(path, like)
     with ocp.StandardCheckpointer() as checkpointer:
-        return _from_data(checkpointer.restore(path.absolute(), _to_data(like)), like)
+        return _from_data(checkpointer.restore(path.absolute(), _here(_to_data(like))), like)
 
 
 def check_tree(path: pathlib.Path, like: Any) -> None:
@@ -216,6 +216,12 @@ def _to_data(tree: Any) -> Any:
         return jax.random.key_data(leaf)
 
     return jax.tree.map(convert, tree)
+
+
+def _here(tree: Any) -> Any:
+    """Shapes and dtypes on this machine's device; the checkpoint's own may not be here."""
+    device = jax.sharding.SingleDeviceSharding(jax.devices()[0])
+    return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=device), tree)
 
 
 def _from_data(data: Any, like: Any) -> Any:

@@ -92,6 +92,8 @@ class _Try:
     max_steps: int = EnvConfig.max_steps
 
     def load(self) -> Agent:
+        if not 0 <= self.seed < 2**31:
+            raise ValueError(f"seed is {self.seed}: give 0 to {2**31 - 1}")
         options = {"env": self.env, "physics": self.physics}
         given = {name: value for name, value in options.items() if value is not None}
         return load_agent(self.agent, max_steps=self.max_steps, **given)

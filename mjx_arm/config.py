@@ -104,7 +104,8 @@ class EnvConfig:
         _one_of("observation", self.observation, OBSERVATIONS)
         _one_of("cube_moves", self.cube_moves, CUBE_MOVES)
         _one_of("start", self.start, STARTS)
-        for name in ("lift", "max_steps", "degrees_per_action"):
+        _whole("max_steps", self.max_steps, at_least=1)
+        for name in ("lift", "degrees_per_action"):
             _positive(name, getattr(self, name))
         if not 0.0 <= self.joint_noise <= 45.0:
             raise ValueError(f"joint_noise is {self.joint_noise}: give 0 to 45 degrees")
@@ -146,6 +147,13 @@ def env_config(name: str, **options: Any) -> EnvConfig:
 def _one_of(what: str, value: Any, known: tuple[str, ...]) -> None:
     if value not in known:
         raise ValueError(f"unknown {what} {value!r}: give one of {', '.join(known)}")
+
+
+def _whole(name: str, value: int, at_least: int) -> None:
+    if value < at_least:
+        raise ValueError(f"{name} is {value}: give at least {at_least}")
+    if value > _MOST:
+        raise ValueError(f"{name} is {value}: give at most {_MOST}")
 
 
 def _positive(name: str, value: float) -> None:
@@ -255,8 +263,8 @@ class TrainConfig:
         _one_of("reward", self.reward, REWARDS)
         _one_of("storage", self.storage, ("states", "pixels"))
         for name in _COUNTS:
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} is {getattr(self, name)}: give at least 1")
+            _whole(name, getattr(self, name), at_least=1)
+        _whole("learning_starts", self.learning_starts, at_least=0)
         if not 0 <= self.seed <= _MOST_SEED - self.num_seeds:
             raise ValueError(f"seed is {self.seed}: give 0 to {_MOST_SEED - self.num_seeds}")
         if self.total_steps > _MOST_STEPS:
@@ -272,7 +280,7 @@ class TrainConfig:
             )
         if self.select_every < 0:
             raise ValueError(f"select_every is {self.select_every}: give 0 or more")
-        for name in ("learning_rate", "reward_scale"):
+        for name in ("learning_rate", "reward_scale", "gamma"):
             _positive(name, getattr(self, name))
         for name in ("epsilon_start", "epsilon_end", "gamma", "polyak"):
             if not 0.0 <= getattr(self, name) <= 1.0:
@@ -331,7 +339,8 @@ class TrainConfig:
         )
 
 
-# Slots, steps and seeds are 32 bits wide; steps with room for a last chunk.
+# All counts are 32 bits wide; steps with room for a last chunk.
+_MOST = 2**31 - 1
 _MOST_SLOTS = 2**30
 _MOST_STEPS = 2_000_000_000
 _MOST_SEED = 2**31

@@ -190,6 +190,12 @@ def half_square(error: jax.Array) -> jax.Array:
     return 0.5 * error * error
 
 
+def check_epsilon(epsilon: float) -> None:
+    """Raises ValueError for what is no share of random actions."""
+    if not 0.0 <= epsilon <= 1.0:
+        raise ValueError(f"epsilon is {epsilon}: give 0 to 1")
+
+
 def epsilon_greedy(key: jax.Array, q: jax.Array, epsilon: jax.Array) -> jax.Array:
     """Actions for Q-values `[N, A] float32`, `[N] int32`; consumes the key.
 

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_arm.auto_reset import AutoReset, AutoResetState
-from mjx_arm.dqn import epsilon_greedy
+from mjx_arm.dqn import check_epsilon, epsilon_greedy
 from mjx_arm.env import Env
 from mjx_arm.physics import compiler_options
 
@@ -80,8 +80,7 @@ def make_evaluator(
     """
     if episodes < 1:
         raise ValueError(f"episodes is {episodes}: give at least 1")
-    if not 0.0 <= epsilon <= 1.0:
-        raise ValueError(f"epsilon is {epsilon}: give 0 to 1")
+    check_epsilon(epsilon)
     auto = AutoReset(env)
 
     def advance_run(params: Any, run: _Run) -> _Run:

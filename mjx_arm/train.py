@@ -22,6 +22,7 @@ from rich.console import Console
 
 from mjx_arm.agent import (
     BEST,
+    CONFIG,
     LAST,
     evaluation_env,
     find_agent,
@@ -52,6 +53,7 @@ from mjx_arm.report.video import draw_episode, record_episode, write_video
 _SELECTION_SEED = 2_000_003
 _EVALUATION_SEED = 1_000_003
 _EVALUATION_EPSILON = 0.1
+_EVALUATION = "evaluation.json"
 Evaluate = Callable[[Any, int], Evaluation]
 RunChunk = Callable[[LoopState], tuple[LoopState, Counts]]
 # Chunks between two checkpoints.
@@ -118,6 +120,7 @@ def resume(
       RunInterruptedError: Ctrl-C.
     """
     _check_episodes(eval_episodes)
+    _check_whole_run(folder)
     saved = config = load_config(folder)
     if total_steps is not None:
         config = dataclasses.replace(config, total_steps=total_steps)
@@ -150,12 +153,23 @@ def _check_episodes(eval_episodes: int) -> None:
         raise ValueError(f"eval_episodes is {eval_episodes}: give at least 1")
 
 
+def _check_whole_run(folder: pathlib.Path) -> None:
+    """Refuses the folder of one seed of several, whose checkpoints are those of all."""
+    parent = folder.resolve().parent
+    if not (parent / CONFIG).is_file():
+        return
+    seeds = seed_folders(parent, load_config(parent))
+    if len(seeds) > 1 and folder.resolve() in seeds:
+        raise ValueError(f"{folder} is one seed of several: give the folder of all, {parent}")
+
+
 def _has_saved(trainer: Trainer, folder: pathlib.Path) -> bool:
-    """Whether a run got as far as its first checkpoint."""
+    """Whether a run got as far as its first checkpoint; that may be its last."""
     config = trainer.config
     unsaved = _SAVE_EVERY * config.chunk_length * config.num_envs
-    reached = last_env_steps(seed_folders(folder, config)[0])
-    return RunCheckpoints(folder).newest() is not None or reached > unsaved
+    first = seed_folders(folder, config)[0]
+    ended = (first / _EVALUATION).is_file()
+    return ended or RunCheckpoints(folder).newest() is not None or last_env_steps(first) > unsaved
 
 
 def _prepare(config: TrainConfig, console: Console) -> Trainer:
@@ -200,12 +214,13 @@ def _seed_configs(config: TrainConfig) -> list[TrainConfig]:
 
 
 def _save_configs(folder: pathlib.Path, config: TrainConfig) -> None:
-    save_config(folder, config)
     if config.num_seeds > 1:
         pairs = zip(seed_folders(folder, config), _seed_configs(config), strict=True)
         for seed_folder, seed_config in pairs:
             seed_folder.mkdir(exist_ok=True)
             save_config(seed_folder, seed_config)
+    # Last: what has this can go on.
+    save_config(folder, config)
 
 
 def _of_seed(tree: Any, config: TrainConfig, i: int) -> Any:
@@ -374,7 +389,7 @@ def _finish_seed(folder: pathlib.Path, eval_episodes: int, console: Console) -> 
         epsilon=_EVALUATION_EPSILON,
         seed=_EVALUATION_SEED,
     )
-    (folder / "evaluation.json").write_text(json.dumps(dataclasses.asdict(result)) + "\n")
+    (folder / _EVALUATION).write_text(json.dumps(dataclasses.asdict(result)) + "\n")
     low, high = result.ci95
     console.print(
         f"evaluation: {result.successes} of {result.episodes} episodes succeeded, "

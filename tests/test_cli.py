@@ -131,6 +131,11 @@ def test_the_agent_acts(run_folder):
         (["--select-every", "-1"], "select_every is -1"),
         (["--eval-episodes", "0"], "eval_episodes is 0"),
         (["--seed", "-1"], "seed is -1"),
+        (["--max-steps", "3000000000"], "max_steps is 3000000000: give at most"),
+        (["--epsilon-steps", "3000000000"], "epsilon_steps is 3000000000: give at most"),
+        (["--learning-starts", "200000000000"], "learning_starts is 200000000000: give at most"),
+        (["--learning-starts", "-1"], "learning_starts is -1: give at least 0"),
+        (["--gamma", "0"], "gamma is 0.0: give a number above 0"),
         (["--seed", "2147483647", "--num-seeds", "2"], "seed is 2147483647"),
         (["--total-steps", "3000000000"], "total_steps is 3000000000"),
         (["--strides", "0", "1", "1"], "strides is (0, 1, 1)"),
@@ -242,6 +247,27 @@ def test_figures_draws_the_curves_again(run_folder, capsys):
     assert main(["figures", str(run_folder)]) == 0
     assert (run_folder / "learning.png").is_file()
     assert "learning.png" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("command", ["eval", "play"])
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--epsilon", "10"], "epsilon is 10.0: give 0 to 1"),
+        (["--epsilon", "nan"], "epsilon is nan: give 0 to 1"),
+        (["--seed", "100000000000000000000"], "seed is 100000000000000000000: give 0 to"),
+        (["--max-steps", "10000000000"], "max_steps is 10000000000: give at most"),
+    ],
+)
+def test_bad_options_of_a_try_are_refused(
+    command, arguments, message, run_folder, tmp_path, capsys, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    assert main([command, str(run_folder), *arguments]) == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("command", ["eval", "play", "figures"])

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import os
 import pathlib
 import random
+import re
 import shutil
 import signal
 import subprocess
 import sys
 import time
+import zlib
 
 import jax
 import numpy as np
@@ -164,6 +167,43 @@ def test_a_run_whose_checkpoints_are_gone_does_not_begin_again(whole_run, tmp_pa
     assert main(["train", "--resume", str(folder)]) == 2
     assert "holds no checkpoint to go on from" in capsys.readouterr().err
     assert (folder / "metrics.jsonl").read_text() == before
+
+
+def test_a_short_run_whose_checkpoints_are_gone_does_not_begin_again(tmp_path, capsys):
+    folder = tmp_path / "run"
+    short = ["--total-steps", "400", "--out", str(folder)]
+    assert main(["train", *OPTIONS, *short]) == 0
+    shutil.rmtree(folder / "checkpoints")
+    before = (folder / "metrics.jsonl").read_text()
+    assert main(["train", "--resume", str(folder)]) == 2
+    assert "holds no checkpoint to go on from" in capsys.readouterr().err
+    assert (folder / "metrics.jsonl").read_text() == before
+
+
+def test_one_seed_of_several_does_not_go_on_alone(tmp_path, capsys):
+    folder = tmp_path / "run"
+    short = ["--total-steps", "400", "--num-seeds", "2", "--out", str(folder)]
+    assert main(["train", *OPTIONS, *short]) == 0
+    before = (folder / "seed-0/metrics.jsonl").read_text()
+    assert main(["train", "--resume", str(folder / "seed-0")]) == 2
+    assert f"is one seed of several: give the folder of all, {folder}" in capsys.readouterr().err
+    assert (folder / "seed-0/metrics.jsonl").read_text() == before
+
+
+def test_a_checkpoint_of_another_device_is_read(tmp_path):
+    """Orbax would look for the device that it was written from."""
+    path = tmp_path / "tree"
+    save_tree(path, {"x": jax.numpy.arange(3.0)})
+    layout = path / "_sharding"
+    elsewhere, names = re.subn(r"\w+:0", "elsewhere:7", layout.read_text())
+    assert names == 1
+    layout.write_text(elsewhere)
+    manifest = path / "manifest.json"
+    content = json.loads(manifest.read_text())
+    content["files"]["_sharding"] = zlib.crc32(layout.read_bytes())
+    manifest.write_text(json.dumps(content))
+    like = {"x": jax.ShapeDtypeStruct((3,), jax.numpy.float32)}
+    np.testing.assert_array_equal(load_tree(path, like)["x"], np.arange(3.0))
 
 
 def test_fewer_steps_than_are_done_are_refused(whole_run, capsys):

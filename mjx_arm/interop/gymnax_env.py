@@ -56,8 +56,9 @@ class GymnaxEnv(Environment):
         """
         params = self.default_params if params is None else params
         state, transition = self.env.transition(state, jnp.asarray(action, jnp.int32))
-        too_long = (state.step >= params.max_steps_in_episode) & ~transition.terminated
-        truncated = transition.truncated | too_long
+        # By this length alone, which may be more than that of the environment's own configuration.
+        too_long = state.step >= params.max_steps_in_episode
+        truncated = (too_long | transition.info["diverged"]) & ~transition.terminated
         ended = transition.terminated | truncated
         final = self.env.observe(state)
         fresh = self.env.restart(key, state, needed=ended)

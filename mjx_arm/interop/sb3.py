@@ -15,7 +15,8 @@ class ArmCubeVecEnv(VecEnv):
     """Many environments, for any algorithm of Stable-Baselines3.
 
     A single one needs no adapter, nor do a few in a `DummyVecEnv`; these all step at once. `infos`
-    have `success`, `grasped`, `height`, `distance` and the rest of `mjx_arm.env.Transition.info`.
+    have `success`, the same as `is_success`, `grasped`, `height`, `distance` and the rest of
+    `mjx_arm.env.Transition.info`.
 
     Args:
       name: environment, `"A"` or `"B"`.
@@ -51,7 +52,9 @@ class ArmCubeVecEnv(VecEnv):
         final = info.pop("final_obs", None)
         names = [name for name in info if not name.startswith("_") and name != "final_info"]
         infos: list[dict[str, Any]] = [
-            {name: info[name][i] for name in names} for i in range(self.num_envs)
+            # The name by which its logs and callbacks know a success.
+            {name: info[name][i] for name in names} | {"is_success": bool(info["success"][i])}
+            for i in range(self.num_envs)
         ]
         ended = terminated | truncated
         for i in np.flatnonzero(ended):

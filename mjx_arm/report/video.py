@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_arm.dqn import epsilon_greedy
+from mjx_arm.dqn import check_epsilon, epsilon_greedy
 from mjx_arm.env import Env
 from mjx_arm.physics import compiler_options
 from mjx_arm.render import make_renderer, rgb
@@ -44,7 +44,12 @@ def record_episode(
     epsilon: float,
     seed: int,
 ) -> Episode:
-    """Runs an epsilon-greedy policy for one episode."""
+    """Runs an epsilon-greedy policy for one episode.
+
+    Raises:
+      ValueError: `epsilon` outside 0 to 1.
+    """
+    check_epsilon(epsilon)
 
     def step(carry: tuple[Any, ...], _: None) -> tuple[tuple[Any, ...], tuple[jax.Array, ...]]:
         state, key, running = carry

@@ -152,6 +152,7 @@ def test_stable_baselines3_takes_many_in_one_call():
     obs, _, _, infos = steps[-1]
     np.testing.assert_allclose(obs, first, atol=1e-6)
     assert all(info["TimeLimit.truncated"] and not info["success"] for info in infos)
+    assert [info["is_success"] for info in infos] == [False] * 3
     # What an episode ended with is not what the next one begins with.
     assert np.abs(infos[0]["terminal_observation"] - first[0]).max() > 1e-3
     with pytest.raises(AttributeError, match="cannot be set"):

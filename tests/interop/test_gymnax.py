@@ -38,11 +38,22 @@ def test_the_length_of_episodes_is_a_parameter(gymnax_env):
     env = gymnax_env.GymnaxEnv("A", **OPTIONS)
     params = env.default_params.replace(max_steps_in_episode=2)
     _, state = env.reset(jax.random.key(0), params)
+    assert _truncated(env, state, params, 4) == [False, True, False, True]
+
+
+def test_episodes_may_be_longer_than_their_configuration(gymnax_env):
+    env = gymnax_env.GymnaxEnv("A", max_steps=2, **OPTIONS)
+    params = env.default_params.replace(max_steps_in_episode=4)
+    _, state = env.reset(jax.random.key(0), params)
+    assert _truncated(env, state, params, 4) == [False, False, False, True]
+
+
+def _truncated(env, state, params, steps):
     flags = []
-    for step in range(4):
+    for step in range(steps):
         _, state, *_, truncated, _ = env.step(jax.random.key(step), state, 2, params)
         flags.append(bool(truncated))
-    assert flags == [False, True, False, True]
+    return flags
 
 
 def test_spaces_are_gymnaxs(gymnax_env):
