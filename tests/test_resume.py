@@ -19,7 +19,7 @@ import jax
 import numpy as np
 import pytest
 
-from mjx_arm.agent import load_agent, load_config
+from mjx_arm.agent import load_agent, load_config, save_config
 from mjx_arm.checkpoint import RunCheckpoints, load_tree, save_tree
 from mjx_arm.cli import main
 from mjx_arm.config import PRESETS
@@ -150,10 +150,10 @@ def test_damage_of_any_kind_is_found(damage, whole_run, tmp_path, capsys):
 @pytest.mark.slow
 def test_a_run_that_has_saved_nothing_yet_begins_again(whole_run, tmp_path):
     folder = tmp_path / "run"
-    shutil.copytree(whole_run, folder)
-    shutil.rmtree(folder / "checkpoints")
-    # Nine chunks of 200 steps, and half of the line of the tenth.
-    lines = (folder / "metrics.jsonl").read_text().splitlines(keepends=True)
+    folder.mkdir()
+    save_config(folder, load_config(whole_run))
+    # Nine chunks of 200 steps, and half of the line of the tenth: there is nothing else yet.
+    lines = (whole_run / "metrics.jsonl").read_text().splitlines(keepends=True)
     (folder / "metrics.jsonl").write_text("".join(lines[:9]) + lines[9][:20])
     assert main(["train", "--resume", str(folder), "--eval-episodes", "4"]) == 0
     assert_same_run(folder, whole_run)
