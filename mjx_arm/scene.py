@@ -49,6 +49,7 @@ class TaskIds:
       cube_half_size: half the cube's edge, m.
       cube_rectangle: `[4] float32`, centre x, y and half extents x, y of the cube's places, m.
       substeps: physics substeps in one iteration.
+      mjx_iterations: `[2] int`, most iterations of MJX's solver, and of its line search.
     """
 
     arm_qpos: np.ndarray
@@ -65,6 +66,7 @@ class TaskIds:
     cube_half_size: float
     cube_rectangle: np.ndarray
     substeps: int
+    mjx_iterations: np.ndarray
 
 
 def available_scenes() -> list[str]:
@@ -153,6 +155,7 @@ def resolve_task(scene: Scene) -> TaskIds:
         cube_half_size=float(model.geom_size[cube_geom, 0]),
         cube_rectangle=_numeric(scene, "cube_rectangle", 4),
         substeps=int(_numeric(scene, "substeps", 1)[0]),
+        mjx_iterations=_mjx_iterations(scene),
     )
 
 
@@ -167,6 +170,13 @@ def _id(scene: Scene, kind: str, name: str) -> int:
     except KeyError:
         what = "keyframe" if kind == "key" else kind
         raise ValueError(f"scene {scene.name!r} has no {what} named {name!r}") from None
+
+
+def _mjx_iterations(scene: Scene) -> np.ndarray:
+    option = scene.mj_model.opt
+    if mujoco.mj_name2id(scene.mj_model, mujoco.mjtObj.mjOBJ_NUMERIC, "mjx_iterations") < 0:
+        return np.asarray([option.iterations, option.ls_iterations])
+    return _numeric(scene, "mjx_iterations", 2).astype(int)
 
 
 def _numeric(scene: Scene, name: str, size: int) -> np.ndarray:

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 
 import jax
 import jax.numpy as jnp
@@ -201,6 +202,16 @@ def test_configuration_is_never_mutated(run):
     assert trainer.config == CONFIG
     with pytest.raises(dataclasses.FrozenInstanceError):
         trainer.config.seed = 2
+
+
+def test_a_chunk_is_a_program_for_cuda_without_a_call_of_the_host(monkeypatch):
+    """As far as a machine without a GPU can tell: what jax hands to the compiler."""
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    trainer = make_trainer(dataclasses.replace(CONFIG, physics="auto"))
+    shapes = jax.eval_shape(trainer.init, run_keys(CONFIG))
+    program = trainer.run_chunk.trace(shapes).lower(lowering_platforms=("cuda",)).as_text()
+    calls = set(re.findall(r"custom_call @(\w+)", program))
+    assert calls == {"cusolver_potrf_ffi"}, "MJX's batched Cholesky, on the device"
 
 
 @pytest.mark.slow

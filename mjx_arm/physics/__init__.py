@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import importlib.util
 
 import jax
@@ -19,7 +20,8 @@ def make_physics(scene: Scene, backend: str = "auto") -> Physics:
     """Makes the physics of a scene.
 
     Args:
-      scene: a scene of the task; it says how many substeps an iteration has.
+      scene: a scene of the task; it says how many substeps an iteration has, and how many
+        iterations MJX's solver has at most.
       backend: `"native"` (MuJoCo's C++ thread pool; CPU), `"mjx"`, `"mjx-warp"` (needs the extra
         `warp`), or `"auto"`: native where jax runs on CPU, mjx elsewhere.
 
@@ -38,15 +40,17 @@ def make_physics(scene: Scene, backend: str = "auto") -> Physics:
             "physics 'mjx-warp' needs the extra 'warp': pip install 'mjx-arm[warp]', "
             "or give physics='mjx'"
         )
-    substeps = resolve_task(scene).substeps
+    ids = resolve_task(scene)
     if backend == "native":
         from mjx_arm.physics.native import make_native
 
-        return make_native(scene.mj_model, substeps)
+        return make_native(scene.mj_model, ids.substeps)
     # MJX takes seconds to import, and the native backend does without it.
     from mjx_arm.physics.mjx import make_mjx
 
-    return make_mjx(scene.mj_model, substeps, impl="warp" if backend == "mjx-warp" else "jax")
+    mj_model = copy.copy(scene.mj_model)
+    mj_model.opt.iterations, mj_model.opt.ls_iterations = ids.mjx_iterations
+    return make_mjx(mj_model, ids.substeps, impl="warp" if backend == "mjx-warp" else "jax")
 
 
 def compiler_options(physics: Physics) -> dict[str, bool]:

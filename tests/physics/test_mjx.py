@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import copy
 import importlib.util
+import pathlib
 import subprocess
 import sys
 
@@ -14,6 +15,7 @@ from physics_lab import scan_of
 
 from mjx_arm.physics import make_physics
 from mjx_arm.physics.mjx import make_mjx
+from mjx_arm.scene import load_scene, resolve_task
 
 WITHOUT_WARP = importlib.util.find_spec("warp") is None
 
@@ -99,6 +101,25 @@ def test_products_keep_all_bits(scene, ids):
     products = [line for line in program.splitlines() if "dot_general" in line]
     assert len(products) > 10
     assert all("HIGHEST, HIGHEST" in line for line in products)
+
+
+def test_the_scene_says_how_often_mjx_iterates(scene, ids, tmp_path):
+    """A solver of one iteration is written out, without a loop."""
+    text = (pathlib.Path(__file__).parents[2] / "xml/arm_cube.xml").read_text()
+    numeric = '<numeric name="mjx_iterations" data="5 8"/>'
+    assert text.count(numeric) == 1
+    loops = {}
+    for name, other in [("once", numeric.replace("5 8", "1 8")), ("as option", "")]:
+        path = tmp_path / "scene.xml"
+        path.write_text(text.replace(numeric, other))
+        other_scene = load_scene(path)
+        physics = make_physics(other_scene, "mjx")
+        state = physics.init(jnp.asarray(ids.home_qpos), jnp.asarray(ids.home_ctrl))
+        program = jax.jit(physics.step).lower(state, jnp.asarray(ids.home_ctrl)).as_text()
+        loops[name] = program.count("stablehlo.while")
+    assert loops["once"] == loops["as option"] - 1
+    assert resolve_task(scene).mjx_iterations.tolist() == [5, 8]
+    assert resolve_task(other_scene).mjx_iterations.tolist() == [10, 20]
 
 
 @pytest.mark.skipif(not WITHOUT_WARP, reason="the extra 'warp' is installed")
