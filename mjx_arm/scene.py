@@ -176,7 +176,12 @@ def _mjx_iterations(scene: Scene) -> np.ndarray:
     option = scene.mj_model.opt
     if mujoco.mj_name2id(scene.mj_model, mujoco.mjtObj.mjOBJ_NUMERIC, "mjx_iterations") < 0:
         return np.asarray([option.iterations, option.ls_iterations])
-    return _numeric(scene, "mjx_iterations", 2).astype(int)
+    counts = _numeric(scene, "mjx_iterations", 2).astype(int)
+    if (counts < 1).any():
+        raise ValueError(
+            f"scene {scene.name!r}: numeric 'mjx_iterations' must hold two counts from 1"
+        )
+    return counts
 
 
 def _numeric(scene: Scene, name: str, size: int) -> np.ndarray:

@@ -120,6 +120,9 @@ def test_the_scene_says_how_often_mjx_iterates(scene, ids, tmp_path):
     assert loops["once"] == loops["as option"] - 1
     assert resolve_task(scene).mjx_iterations.tolist() == [5, 8]
     assert resolve_task(other_scene).mjx_iterations.tolist() == [10, 20]
+    path.write_text(text.replace(numeric, numeric.replace("5 8", "5 0")))
+    with pytest.raises(ValueError, match="'mjx_iterations' must hold two counts from 1"):
+        resolve_task(load_scene(path))
 
 
 @pytest.mark.skipif(not WITHOUT_WARP, reason="the extra 'warp' is installed")
