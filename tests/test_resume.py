@@ -73,6 +73,13 @@ def assert_same_run(one: pathlib.Path, other: pathlib.Path) -> None:
             np.testing.assert_array_equal(a, b)
 
 
+def assert_refused_and_untouched(folder: pathlib.Path, message: str, capsys) -> None:
+    before = (folder / "metrics.jsonl").read_text()
+    assert main(["train", "--resume", str(folder)]) == 2
+    assert message in capsys.readouterr().err
+    assert (folder / "metrics.jsonl").read_text() == before
+
+
 def command(*arguments: str) -> list[str]:
     return [sys.executable, "-m", "mjx_arm", "train", *arguments]
 
@@ -163,10 +170,7 @@ def test_a_run_whose_checkpoints_are_gone_does_not_begin_again(whole_run, tmp_pa
     folder = tmp_path / "run"
     shutil.copytree(whole_run, folder)
     shutil.rmtree(folder / "checkpoints")
-    before = (folder / "metrics.jsonl").read_text()
-    assert main(["train", "--resume", str(folder)]) == 2
-    assert "holds no checkpoint to go on from" in capsys.readouterr().err
-    assert (folder / "metrics.jsonl").read_text() == before
+    assert_refused_and_untouched(folder, "holds no checkpoint to go on from", capsys)
 
 
 def test_a_short_run_whose_checkpoints_are_gone_does_not_begin_again(tmp_path, capsys):
@@ -174,20 +178,15 @@ def test_a_short_run_whose_checkpoints_are_gone_does_not_begin_again(tmp_path, c
     short = ["--total-steps", "400", "--out", str(folder)]
     assert main(["train", *OPTIONS, *short]) == 0
     shutil.rmtree(folder / "checkpoints")
-    before = (folder / "metrics.jsonl").read_text()
-    assert main(["train", "--resume", str(folder)]) == 2
-    assert "holds no checkpoint to go on from" in capsys.readouterr().err
-    assert (folder / "metrics.jsonl").read_text() == before
+    assert_refused_and_untouched(folder, "holds no checkpoint to go on from", capsys)
 
 
 def test_one_seed_of_several_does_not_go_on_alone(tmp_path, capsys):
     folder = tmp_path / "run"
     short = ["--total-steps", "400", "--num-seeds", "2", "--out", str(folder)]
     assert main(["train", *OPTIONS, *short]) == 0
-    before = (folder / "seed-0/metrics.jsonl").read_text()
-    assert main(["train", "--resume", str(folder / "seed-0")]) == 2
-    assert f"is one seed of several: give the folder of all, {folder}" in capsys.readouterr().err
-    assert (folder / "seed-0/metrics.jsonl").read_text() == before
+    message = f"is one seed of several: give the folder of all, {folder}"
+    assert_refused_and_untouched(folder / "seed-0", message, capsys)
 
 
 def test_a_checkpoint_of_another_device_is_read(tmp_path):
