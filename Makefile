@@ -1,4 +1,4 @@
-# Needs Python 3.11 or 3.12, make and a network; all else comes from the lock in requirements/.
+# Needs Python 3.11, 3.12 or 3.13, make and a network; all else comes from the lock in requirements/.
 PYTHON ?= python3
 VENV := .venv
 GPU :=
@@ -18,7 +18,7 @@ LOCK := $(or $(GPU),$(if $(filter setup,$(MAKECMDGOALS)),,$(INSTALLED)),cpu)
 STAMP := $(VENV)/.locked-$(LOCK)
 
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
-SUPPORTED := import sys; sys.exit(sys.version_info[:2] not in {(3, 11), (3, 12)})
+SUPPORTED := import sys; sys.exit(sys.version_info[:2] not in {(3, 11), (3, 12), (3, 13)})
 
 .PHONY: help setup train test test-slow peers test-peers format lock lock-peers clean
 
@@ -32,14 +32,14 @@ help:
 	@echo "make format     let ruff rewrite the sources"
 	@echo "make lock       resolve the lock again; ARGS=--upgrade for the newest versions"
 	@echo "make clean      remove caches and built packages (not $(VENV), not runs/)"
-	@echo "PYTHON=...      the Python 3.11 or 3.12 that $(VENV) is built with (python3)"
+	@echo "PYTHON=...      the Python 3.11, 3.12 or 3.13 that $(VENV) is built with (python3)"
 
 setup: $(STAMP)
 	@echo "$(VENV) is ready ($(LOCK), $$($(BIN)/python --version)): make train, make test, $(BIN)/mjx-arm --help"
 
 $(VENV)/.locked-%: requirements/%.txt
 	@$(PYTHON) -c "$(SUPPORTED)" 2>/dev/null || \
-	  { echo "Python 3.11 or 3.12 is needed, and '$(PYTHON)' is neither: try make PYTHON=python3.12" >&2; exit 2; }
+	  { echo "Python 3.11, 3.12 or 3.13 is needed, and '$(PYTHON)' is another: try make PYTHON=python3.12" >&2; exit 2; }
 	@test ! -e $(VENV) || test -e $(VENV)/pyvenv.cfg || \
 	  { echo "$(VENV) is there and is no virtual environment: move it away" >&2; exit 2; }
 	@echo "Installing $< into $(VENV): minutes, the first time."
@@ -96,7 +96,7 @@ lock-peers: .venv-lock/bin/uv-$(UV_VERSION)
 	  --constraints .venv-lock/constraints.txt --extra peers $(ARGS) --output-file requirements/peers.txt
 	@sed -i 's/^torch==\([0-9.]*\)+cpu/torch==\1/' requirements/peers.txt
 
-# One file serves Python 3.11 and 3.12, Linux and macOS: markers choose among the versions.
+# One file serves Python 3.11 to 3.13, Linux and macOS: markers choose among the versions.
 compile = UV_CUSTOM_COMPILE_COMMAND="make lock" .venv-lock/bin/uv pip compile pyproject.toml \
   --no-config --quiet --universal --python-version 3.11 --generate-hashes --no-emit-index-url \
   --extra dev $(2) $(ARGS) --output-file requirements/$(1).txt

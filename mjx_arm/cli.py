@@ -16,15 +16,23 @@ from collections.abc import Sequence
 from types import FrameType
 from typing import Annotated, Any, NoReturn
 
+import jax
 import tyro
 from rich.console import Console
 
-from mjx_arm.agent import Agent, load_agent, load_config
-from mjx_arm.config import PRESETS, EnvConfig, TrainConfig
-from mjx_arm.evaluate import evaluate
+from mjx_arm.config import TrainConfig, set_train_options
+from mjx_arm.options import check_name, flat_names, get_option
+from mjx_arm.presets import PRESETS
 from mjx_arm.report.figures import plot_curves
 from mjx_arm.report.video import check_video_path, draw_episode, record_episode, write_video
-from mjx_arm.train import RunInterruptedError, resume, seed_folders, train
+from mjx_arm.training.agent import Agent, differences, load_agent
+from mjx_arm.training.evaluate import evaluate
+from mjx_arm.training.loop import EVALUATION, role_key
+from mjx_arm.training.run_folder import load_config, parse_run, read_text, seed_folders
+from mjx_arm.training.runner import RunInterruptedError, resume, train
+
+# Options that may change when a run is resumed.
+_CHANGEABLE = frozenset({"resume", "total_steps", "eval_episodes", "stop_at"})
 
 
 @dataclasses.dataclass(frozen=True)
@@ -32,42 +40,65 @@ class Train:
     """Train an arm from pixels to grasp a cube and lift it.
 
     Attributes:
-      preset: starting point of all other options: `fast` reaches over 90 % in A on two CPU cores,
-        `smoke` ends within 3 minutes, `paper` has the values of James & Johns 2016.
-      config: options of the run.
+      preset: starting point of all other options. `fast`: the default on a CPU; a teacher that
+        sees the simulator's state learns, and an agent that sees pixels alone learns from it.
+        `pixels`: no network ever sees the state. `smoke`: everything once, within 3 minutes.
+        `paper`: the values of James & Johns 2016. `gpu`: the default on an accelerator, `fast` with
+        thousands of environments.
+      config: a JSON file with options to start from instead of a preset, such as the `config.json`
+        of a run.
+      options: options of the run.
       out: folder for everything the run leaves; by default `runs/` and the time.
-      resume: folder of a run to go on with; of the options only `--total-steps` may then change.
+      resume: folder of a run to continue; only `--total-steps`, `--eval-episodes` and `--stop-at`
+        may then be given.
+      init_from: an agent or a run folder whose network the run starts from.
+      stop_at: end the run when an evaluation that selects has reached this success rate.
       eval_episodes: episodes of the evaluation at the end, by the best agent, at epsilon 0.1 and on
         starts and random numbers that neither training nor the selection has seen.
     """
 
-    config: Annotated[TrainConfig, tyro.conf.arg(name="")]
+    options: Annotated[TrainConfig, tyro.conf.arg(name="")]
     preset: str = "fast"
+    config: pathlib.Path | None = None
     out: pathlib.Path | None = None
     resume: pathlib.Path | None = None
+    init_from: pathlib.Path | None = None
+    stop_at: float | None = None
     eval_episodes: int = 200
 
     def run(self, given: frozenset[str]) -> None:
         """Runs the command; `given` are the names of the options on the command line."""
-        if self.resume is not None:
-            self._resume(self.resume, given)
-            return
         console = Console(highlight=False)
-        train(self.config, self.out, eval_episodes=self.eval_episodes, console=console)
+        if self.resume is not None:
+            self._resume(self.resume, given, console)
+            return
+        if self.config is None:
+            console.print(f"preset: {self.preset}")
+        train(
+            self.options,
+            self.out,
+            eval_episodes=self.eval_episodes,
+            stop_at=self.stop_at,
+            init_from=self.init_from,
+            console=console,
+        )
 
-    def _resume(self, folder: pathlib.Path, given: frozenset[str]) -> None:
+    def _resume(self, folder: pathlib.Path, given: frozenset[str], console: Console) -> None:
         saved = load_config(folder)
-        changed = given - {"resume", "total_steps", "eval_episodes"}
-        for name in sorted(changed):
-            value = getattr(self.config, name, None)
-            if value != getattr(saved, name, folder) and (name, value) != ("physics", "auto"):
+        names = flat_names(saved)
+        for name in sorted(given - _CHANGEABLE):
+            value = get_option(self.options, name) if name in names else self
+            if name == "physics" and value == "auto":
+                continue
+            if name not in names or value != get_option(saved, name):
                 option = name.replace("_", "-")
-                raise ValueError(f"--{option} cannot change when a run goes on; leave it out")
+                raise ValueError(f"--{option} cannot change when a run is resumed; leave it out")
         resume(
             folder,
-            total_steps=self.config.total_steps if "total_steps" in given else None,
+            total_steps=self.options.total_steps if "total_steps" in given else None,
             eval_episodes=self.eval_episodes,
-            console=Console(highlight=False),
+            stop_at=self.stop_at,
+            console=console,
         )
 
 
@@ -78,7 +109,7 @@ class _Try:
     Attributes:
       agent: an agent's file, or a run folder, of which the best agent is taken.
       env: environment, `A` or `B`; by default the one it was trained in.
-      physics: backend; by default native on CPU and mjx elsewhere.
+      physics: backend; by default native on a CPU and mjx on other devices.
       epsilon: share of random actions.
       seed: of starts and random actions.
       max_steps: iterations until an episode is truncated.
@@ -89,14 +120,17 @@ class _Try:
     physics: str | None = None
     epsilon: float = 0.1
     seed: int = 7
-    max_steps: int = EnvConfig.max_steps
+    max_steps: int = 1_000
 
     def load(self) -> Agent:
         if not 0 <= self.seed < 2**31:
-            raise ValueError(f"seed is {self.seed}: give 0 to {2**31 - 1}")
+            raise ValueError(f"seed must be from 0 to {2**31 - 1}, got {self.seed}")
         options = {"env": self.env, "physics": self.physics}
         given = {name: value for name, value in options.items() if value is not None}
         return load_agent(self.agent, max_steps=self.max_steps, **given)
+
+    def key(self) -> jax.Array:
+        return role_key(self.seed, EVALUATION)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -117,18 +151,20 @@ class Eval(_Try):
         agent = self.load()
         result = evaluate(
             agent.env,
-            agent.dqn.apply,
+            agent.apply,
             agent.params,
             episodes=self.episodes,
             epsilon=self.epsilon,
-            seed=self.seed,
+            key=self.key(),
         )
         report = dataclasses.asdict(result)
         if self.json:
             print(json.dumps(report))
             return
-        for name, value in report.items():
-            print(f"{name:<12} {value}")
+        for name, value in (report | report.pop("metrics")).items():
+            print(f"{name:<22} {value}")
+        for name, (trained, judged) in differences(agent.trained_env, agent.config.env).items():
+            print(f"trained with {name} = {trained}, judged with {judged}")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -147,10 +183,10 @@ class Play(_Try):
         check_video_path(self.out)
         agent = self.load()
         episode = record_episode(
-            agent.env, agent.dqn.apply, agent.params, epsilon=self.epsilon, seed=self.seed
+            agent.env, agent.apply, agent.params, epsilon=self.epsilon, key=self.key()
         )
         write_video(self.out, draw_episode(agent.env, episode))
-        print(f"{self.out}: {len(episode.qpos)} frames, success: {episode.success}")
+        print(f"{self.out}: {len(episode)} frames, success: {episode.success}")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -171,26 +207,50 @@ class Figures:
             print(path)
 
 
+def default_preset() -> str:
+    """`gpu` on an accelerator, `fast` on a CPU."""
+    return "fast" if jax.default_backend() == "cpu" else "gpu"
+
+
+def _start(arguments: Sequence[str]) -> Train:
+    """The options that a command line starts from: those of its preset or file, and its task's."""
+    first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    for name in ("preset", "config", "task", "algorithm"):
+        first.add_argument(f"--{name}", nargs="?")
+    known = first.parse_known_args(arguments)[0]
+    preset = known.preset or default_preset()
+    check_name("preset", preset, PRESETS)
+    options = PRESETS[preset]
+    if known.config is not None:
+        if known.preset is not None:
+            raise ValueError("--preset and --config exclude each other: give one of them")
+        options = parse_run(read_text(pathlib.Path(known.config)), known.config).config
+    parts = {"task": known.task, "algorithm": known.algorithm}
+    chosen = {name: value for name, value in parts.items() if value is not None}
+    return Train(options=set_train_options(options, chosen), preset=preset)
+
+
 def _parse(arguments: Sequence[str]) -> Train | Eval | Play | Figures:
     """The command of a command line.
 
     Raises:
       ValueError: it does not fit.
     """
-    first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    first.add_argument("--preset", nargs="?", default="fast")
-    preset = first.parse_known_args(arguments)[0].preset
-    if preset not in PRESETS:
-        raise ValueError(f"unknown preset {preset!r}: give one of {', '.join(PRESETS)}")
-    start = Train(config=PRESETS[preset], preset=preset)
-    # The default makes `--help` show the values of the preset.
-    with_preset = Annotated[Train, tyro.conf.subcommand("train", default=start)]
+    # The default makes `--help` show the values of the preset, and the options of the task.
+    with_preset = Annotated[Train, tyro.conf.subcommand("train", default=_start(arguments))]
     commands: Any = with_preset | Eval | Play | Figures
     said = io.StringIO()
     try:
         with contextlib.redirect_stderr(said):
             command: Train | Eval | Play | Figures = tyro.cli(
-                commands, args=arguments, prog="mjx-arm"
+                commands,
+                args=arguments,
+                prog="mjx-arm",
+                config=(
+                    tyro.conf.OmitArgPrefixes,
+                    tyro.conf.OmitSubcommandPrefixes,
+                    tyro.conf.AvoidSubcommands,
+                ),
             )
     except SystemExit as stop:
         if stop.code == 2:
@@ -210,8 +270,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the command line.
 
     Returns:
-      The exit status: 2 for input that does not fit or a disk that does not take the output, 130
-      for a run that was interrupted.
+      The exit status: 2 for invalid input or a disk that does not take the output, 130 for a run
+      that was interrupted.
     """
     arguments = sys.argv[1:] if arguments is None else arguments
     names = (x[2:].split("=")[0] for x in arguments if x.startswith("--"))
@@ -234,7 +294,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def run(arguments: Sequence[str] | None = None) -> NoReturn:
     """Runs the command line as a process of its own, and ends it.
 
-    Ctrl-C ends it where it stands, which no file minds, except while a run trains and saves first.
+    Ctrl-C ends it at once, which damages no file; while a run trains, it saves first.
     """
     signal.signal(signal.SIGINT, _stop)
     sys.exit(main(arguments))
@@ -246,8 +306,8 @@ def _stop(number: int, frame: FrameType | None) -> NoReturn:
     A KeyboardInterrupt would be lost inside of a compilation, or leave one running that crashes
     when Python shuts down around it.
     """
-    # Not by print, which may be what the signal came into.
+    # Not by print, which the signal may have interrupted.
     if os.isatty(1):
         os.write(1, b"\x1b[?25h")  # the cursor, which a progress bar hides
-    os.write(2, b"stopped; a run that has begun goes on with --resume and its folder\n")
+    os.write(2, b"stopped; a run that has started continues with --resume and its folder\n")
     os._exit(130)

@@ -1,4 +1,4 @@
-"""Scenes: an MJCF file compiled by MuJoCo, and the task's names in it resolved to ids once."""
+"""Scenes: MJCF files compiled by MuJoCo. Robots and tasks say what the names in one mean."""
 
 from __future__ import annotations
 
@@ -14,69 +14,103 @@ _PACKAGE = pathlib.Path(__file__).parent
 # An installed package carries its scenes; a checkout has them at the top level.
 _XML_DIRS = (_PACKAGE / "xml", _PACKAGE.parent / "xml")
 
-NUM_ARM_JOINTS = 6
-
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Scene:
     """A compiled model of supported primitives; compared and hashed by identity.
 
     Attributes:
-      name: the scene's name or path, as it was asked for.
+      name: the scene's name or path, as it was given.
       mj_model: the plain MuJoCo model. Treat it as read-only.
+      xml: text of the MJCF file.
     """
 
     name: str
     mj_model: mujoco.MjModel
+    xml: str
 
+    def find(self, kind: str, name: str) -> int:
+        """Id of a named element.
 
-@dataclasses.dataclass(frozen=True)
-class TaskIds:
-    """Where the arm, its gripper and the cube are in a scene's arrays.
+        Args:
+          kind: as MjModel's accessors: `"geom"`, `"site"`, `"joint"`, `"key"`, `"numeric"`, ...
+          name: of the element.
 
-    Attributes:
-      arm_qpos: `[6] int`, addresses of the arm's joints in `qpos`.
-      arm_ctrl: `[6] int`, their position servos in `ctrl`, in the same order.
-      gripper_ctrl: the gripper's command in `ctrl`.
-      finger_qpos: `[2] int`, addresses of the finger slides in `qpos`.
-      cube_qpos: address of the cube's free joint in `qpos` (position, then quaternion).
-      cube_geom: geom id of the cube.
-      grasp_site: site id of the point between the fingers that should meet the cube.
-      pad_geoms: `[2, P] int`, geom ids of the spheres on the left and the right finger.
-      home_qpos: `[nq] float32`, the keyframe `home`.
-      home_ctrl: `[nu] float32`.
-      ctrl_range: `[nu, 2] float32`, lower and upper bounds of `ctrl`.
-      cube_half_size: half the cube's edge, m.
-      cube_rectangle: `[4] float32`, centre x, y and half extents x, y of the cube's places, m.
-      substeps: physics substeps in one iteration.
-      mjx_iterations: `[2] int`, most iterations of MJX's solver, and of its line search.
-    """
+        Raises:
+          ValueError: the scene has no such element.
+        """
+        try:
+            return int(getattr(self.mj_model, kind)(name).id)
+        except KeyError:
+            what = "keyframe" if kind == "key" else kind
+            raise ValueError(f"scene {self.name!r} has no {what} named {name!r}") from None
 
-    arm_qpos: np.ndarray
-    arm_ctrl: np.ndarray
-    gripper_ctrl: int
-    finger_qpos: np.ndarray
-    cube_qpos: int
-    cube_geom: int
-    grasp_site: int
-    pad_geoms: np.ndarray
-    home_qpos: np.ndarray
-    home_ctrl: np.ndarray
-    ctrl_range: np.ndarray
-    cube_half_size: float
-    cube_rectangle: np.ndarray
-    substeps: int
-    mjx_iterations: np.ndarray
+    def has(self, kind: str, name: str) -> bool:
+        """Whether the scene has an element of this kind and name."""
+        try:
+            getattr(self.mj_model, kind)(name)
+        except KeyError:
+            return False
+        return True
+
+    def numbers(self, name: str, size: int) -> np.ndarray:
+        """The data of a `numeric` element, `[size] float64`.
+
+        Raises:
+          ValueError: the scene has no such element, or it has another size, or is not finite.
+        """
+        index = self.find("numeric", name)
+        start, length = self.mj_model.numeric_adr[index], self.mj_model.numeric_size[index]
+        data = np.array(self.mj_model.numeric_data[start : start + length])
+        if length != size or not np.isfinite(data).all():
+            raise ValueError(
+                f"scene {self.name!r}: numeric {name!r} must hold {size} finite numbers, "
+                f"got {data.tolist()}"
+            )
+        return data
+
+    @property
+    def substeps(self) -> int:
+        """Physics substeps in one iteration, the scene's numeric `substeps`.
+
+        Raises:
+          ValueError: it is missing, or not a whole number of at least 1.
+        """
+        return self._counts("substeps", 1)[0]
+
+    @property
+    def mjx_iterations(self) -> tuple[int, int]:
+        """Most iterations of MJX's solver, and of its line search.
+
+        The scene's numeric `mjx_iterations`, or where it has none, those of its `option`.
+
+        Raises:
+          ValueError: they are not whole numbers of at least 1.
+        """
+        option = self.mj_model.opt
+        if not self.has("numeric", "mjx_iterations"):
+            return option.iterations, option.ls_iterations
+        solver, line_search = self._counts("mjx_iterations", 2)
+        return solver, line_search
+
+    def _counts(self, name: str, size: int) -> list[int]:
+        values = self.numbers(name, size)
+        if (values < 1).any() or (values != np.round(values)).any():
+            raise ValueError(
+                f"scene {self.name!r}: numeric {name!r} must hold whole numbers of at least 1, "
+                f"got {values.tolist()}"
+            )
+        return [int(value) for value in values]
 
 
 def available_scenes() -> list[str]:
-    """Returns the names of the scenes that come with the package."""
+    """Names of the scenes that come with the package."""
     found = {path.stem for folder in _XML_DIRS for path in folder.glob("*.xml")}
     return sorted(found)
 
 
 def load_scene(name_or_path: str | pathlib.Path) -> Scene:
-    """Compiles a scene that comes with the package, or any MJCF of supported primitives.
+    """Compiles a scene that comes with the package, or any MJCF file of supported primitives.
 
     Args:
       name_or_path: a name such as `"arm_cube"`, or the path of an MJCF file.
@@ -85,7 +119,8 @@ def load_scene(name_or_path: str | pathlib.Path) -> Scene:
       The scene.
 
     Raises:
-      ValueError: no such scene or file, MuJoCo cannot compile it, or a geom in it cannot be drawn.
+      ValueError: no such scene or file, MuJoCo cannot compile it, or a geom in it cannot be
+        rendered.
     """
     path = _resolve(str(name_or_path))
     try:
@@ -94,7 +129,7 @@ def load_scene(name_or_path: str | pathlib.Path) -> Scene:
         reason = " ".join(str(error).split())
         raise ValueError(f"scene {str(name_or_path)!r} does not compile: {reason}") from error
     validate_geoms(mj_model)
-    return Scene(name=str(name_or_path), mj_model=mj_model)
+    return Scene(name=str(name_or_path), mj_model=mj_model, xml=path.read_text(encoding="utf-8"))
 
 
 def _resolve(name_or_path: str) -> pathlib.Path:
@@ -108,86 +143,3 @@ def _resolve(name_or_path: str) -> pathlib.Path:
         f"unknown scene {name_or_path!r}: give one of {', '.join(available_scenes())}, "
         "or the path of an MJCF file"
     )
-
-
-def resolve_task(scene: Scene) -> TaskIds:
-    """Finds the arm, gripper and cube of the task in a scene.
-
-    Raises:
-      ValueError: a name that the task needs is missing, or is not of the expected kind.
-    """
-    model = scene.mj_model
-    actuators = [model.actuator(i).name for i in range(model.nu)]
-    arm = [i for i, name in enumerate(actuators) if name != "gripper"]
-    if len(arm) != NUM_ARM_JOINTS or "gripper" not in actuators:
-        raise ValueError(
-            f"scene {scene.name!r} has the actuators {actuators}; the task needs "
-            f"{NUM_ARM_JOINTS} joint servos and one named 'gripper'"
-        )
-    joints = model.actuator_trnid[arm, 0]
-    if (model.actuator_trntype[arm] != mujoco.mjtTrn.mjTRN_JOINT).any() or (
-        model.jnt_type[joints] != mujoco.mjtJoint.mjJNT_HINGE
-    ).any():
-        raise ValueError(f"scene {scene.name!r}: the servos other than 'gripper' must turn hinges")
-    home = _id(scene, "key", "home")
-    pads = [
-        [_id(scene, "geom", f"{side}_pad_{i}") for i in range(_count_pads(model, side))]
-        for side in ("left", "right")
-    ]
-    if not pads[0] or len(pads[0]) != len(pads[1]):
-        raise ValueError(
-            f"scene {scene.name!r} needs as many geoms 'left_pad_0', ... as 'right_pad_0', ..."
-        )
-    cube_geom = _id(scene, "geom", "cube")
-    fingers = [_id(scene, "joint", f"{side}_finger") for side in ("left", "right")]
-    return TaskIds(
-        arm_qpos=model.jnt_qposadr[joints],
-        arm_ctrl=np.asarray(arm),
-        gripper_ctrl=actuators.index("gripper"),
-        finger_qpos=model.jnt_qposadr[fingers],
-        cube_qpos=int(model.jnt_qposadr[_id(scene, "joint", "cube")]),
-        cube_geom=cube_geom,
-        grasp_site=_id(scene, "site", "grasp"),
-        pad_geoms=np.asarray(pads),
-        home_qpos=model.key_qpos[home].astype(np.float32),
-        home_ctrl=model.key_ctrl[home].astype(np.float32),
-        ctrl_range=model.actuator_ctrlrange.astype(np.float32),
-        cube_half_size=float(model.geom_size[cube_geom, 0]),
-        cube_rectangle=_numeric(scene, "cube_rectangle", 4),
-        substeps=int(_numeric(scene, "substeps", 1)[0]),
-        mjx_iterations=_mjx_iterations(scene),
-    )
-
-
-def _count_pads(model: mujoco.MjModel, side: str) -> int:
-    names = (model.geom(i).name for i in range(model.ngeom))
-    return sum(name.startswith(f"{side}_pad_") for name in names)
-
-
-def _id(scene: Scene, kind: str, name: str) -> int:
-    try:
-        return int(getattr(scene.mj_model, kind)(name).id)
-    except KeyError:
-        what = "keyframe" if kind == "key" else kind
-        raise ValueError(f"scene {scene.name!r} has no {what} named {name!r}") from None
-
-
-def _mjx_iterations(scene: Scene) -> np.ndarray:
-    option = scene.mj_model.opt
-    if mujoco.mj_name2id(scene.mj_model, mujoco.mjtObj.mjOBJ_NUMERIC, "mjx_iterations") < 0:
-        return np.asarray([option.iterations, option.ls_iterations])
-    counts = _numeric(scene, "mjx_iterations", 2).astype(int)
-    if (counts < 1).any():
-        raise ValueError(
-            f"scene {scene.name!r}: numeric 'mjx_iterations' must hold two counts from 1"
-        )
-    return counts
-
-
-def _numeric(scene: Scene, name: str, size: int) -> np.ndarray:
-    data = scene.mj_model.numeric_data
-    index = _id(scene, "numeric", name)
-    start = scene.mj_model.numeric_adr[index]
-    if scene.mj_model.numeric_size[index] != size:
-        raise ValueError(f"scene {scene.name!r}: numeric {name!r} must hold {size} numbers")
-    return data[start : start + size].astype(np.float32)

@@ -12,10 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 from gymnasium.vector import AutoresetMode
 
-from mjx_arm.auto_reset import AutoReset
-from mjx_arm.env import Env, EnvState, make
+from mjx_arm.envs.auto_reset import AutoReset
+from mjx_arm.envs.env import Env, make
+from mjx_arm.envs.state import EnvState
 from mjx_arm.physics import compiler_options
-from mjx_arm.render import make_renderer, rgb
 
 # Edge of the pictures of `render`, pixels, and of how many a second.
 _PICTURE = 256
@@ -25,7 +25,9 @@ _MODES = {"next_step": AutoresetMode.NEXT_STEP, "same_step": AutoresetMode.SAME_
 
 def observation_space(env: Env) -> gymnasium.Space[Any]:
     """Space of a single environment's observations."""
-    kind, size = env.config.observation, env.config.size
+    kind = env.config.observation
+    cameras = () if len(env.cameras) == 1 else (len(env.cameras),)
+    size = (*cameras, *env.config.size)
     image = gymnasium.spaces.Box(0, 255, (*size, 3), np.uint8)
     if kind == "rgb":
         return image
@@ -55,7 +57,7 @@ class ArmCubeEnv(gymnasium.Env[Any, np.int64]):
 
     `reset` with a seed starts anew; without one it starts the next episode, with what outlives the
     last one (where the cube lies in environment B). Episodes end by themselves, truncated after
-    `max_steps`: no `TimeLimit` is needed. `info` has what `mjx_arm.env.Transition` says.
+    `max_steps`: no `TimeLimit` is needed. `info` has what `Env.step` says.
 
     Args:
       name: environment, `"A"` or `"B"`.
@@ -99,12 +101,11 @@ class ArmCubeEnv(gymnasium.Env[Any, np.int64]):
         """Advances by one iteration.
 
         Raises:
-          ValueError: the action is none, or `reset` was never called.
+          ValueError: the action is not a valid one, or `reset` was never called.
         """
         if self._state is None:
             raise ValueError("step before reset: call reset first")
-        if not self.action_space.contains(np.int64(action)):
-            raise ValueError(f"action is {action}: give an integer from 0 to 13")
+        _check_actions(action, (), self.env.num_actions)
         obs, self._state, reward, terminated, truncated, info = self._step(
             self._state, jnp.int32(action)
         )
@@ -150,7 +151,7 @@ class ArmCubeVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         **options: Any,
     ):
         if num_envs < 1:
-            raise ValueError(f"num_envs is {num_envs}: give at least 1")
+            raise ValueError(f"num_envs must be at least 1, got {num_envs}")
         _check_render_mode(render_mode)
         self.render_mode = render_mode
         self.num_envs = num_envs
@@ -164,6 +165,7 @@ class ArmCubeVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         self.action_space = batch(self.single_action_space, num_envs)
         self._reset = _jit(self.env, jax.vmap(self._auto.reset))
         self._step = _jit(self.env, jax.vmap(self._auto.step))
+        self._observe = _jit(self.env, jax.vmap(lambda state: self.env.observe(state.env)))
         self._state: Any = None
 
     def _keys(self) -> jax.Array:
@@ -174,26 +176,37 @@ class ArmCubeVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
     ) -> tuple[Any, dict[str, Any]]:
         """Starts an episode in every environment.
 
+        Args:
+          seed: one whole number for all environments.
+          options: `{"reset_mask": [num_envs] bool}` restricts the reset to some environments.
+
         Raises:
-          ValueError: `seed` is a list; the environments share one.
+          ValueError: `seed` is a list, or the mask does not fit.
         """
         if isinstance(seed, list):
-            raise ValueError("seed is a list: give one integer, which all environments draw from")
+            raise ValueError("seed must be one whole number for all environments, got a list")
         super().reset(seed=seed)
-        obs, self._state = self._reset(self._keys())
+        obs, state = self._reset(self._keys())
+        mask = (options or {}).get("reset_mask")
+        if mask is not None:
+            mask = np.asarray(mask)
+            if mask.shape != (self.num_envs,) or mask.dtype != np.bool_:
+                raise ValueError(f"reset_mask must be {self.num_envs} booleans, got {mask}")
+            if self._state is not None:
+                old = self._observe(self._state)
+                obs, state = _where_first(mask, (obs, state), (old, self._state))
+        self._state = state
         return _numpy(obs), {}
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """Advances every environment by one iteration, or resets it.
 
         Raises:
-          ValueError: an action is none, or `reset` was never called.
+          ValueError: an action is not a valid one, or `reset` was never called.
         """
         if self._state is None:
             raise ValueError("step before reset: call reset first")
-        actions = np.asarray(actions)
-        if actions.shape != (self.num_envs,) or not ((actions >= 0) & (actions < 14)).all():
-            raise ValueError(f"actions are {actions}: give {self.num_envs} integers from 0 to 13")
+        _check_actions(actions, (self.num_envs,), self.env.num_actions)
         obs, self._state, *rest, info = self._step(
             self._keys(), self._state, jnp.asarray(actions, jnp.int32)
         )
@@ -230,15 +243,28 @@ class ArmCubeVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
 
 
 def _make_picture(env: Env) -> Callable[[EnvState], jax.Array]:
-    """Makes `state -> [256, 256, 3] uint8`."""
-    size = _PICTURE, _PICTURE
-    draw = make_renderer(env.scene, camera=env.config.camera, size=size, shadows=True)
+    """Makes `state -> [256, 256, 3] uint8`, the image of the first camera."""
+    first = env.with_cameras(
+        camera=env.config.cameras[0], size=(_PICTURE, _PICTURE), shadows=True, observation="rgb"
+    )
+    return first.observe  # type: ignore[return-value]
 
-    def picture(state: EnvState) -> jax.Array:
-        poses = state.physics.poses
-        return rgb(draw(poses.geom_xpos, poses.geom_xmat))
 
-    return picture
+def _check_actions(actions: Any, shape: tuple[int, ...], num_actions: int) -> None:
+    values = np.asarray(actions)
+    whole = np.issubdtype(values.dtype, np.integer) and values.shape == shape
+    if not whole or not ((values >= 0) & (values < num_actions)).all():
+        count = f"{shape[0]} whole numbers" if shape else "one whole number"
+        raise ValueError(f"actions must be {count} from 0 to {num_actions - 1}, got {actions}")
+
+
+def _where_first(mask: np.ndarray, new: Any, old: Any) -> Any:
+    """Rows of `new` where the mask is true, else of `old`."""
+
+    def choose(x: jax.Array, y: jax.Array) -> jax.Array:
+        return jnp.where(mask.reshape(-1, *(1,) * (x.ndim - 1)), x, y)
+
+    return jax.tree.map(choose, new, old)
 
 
 def _draw_key(generator: np.random.Generator) -> jax.Array:

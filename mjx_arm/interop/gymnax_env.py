@@ -9,7 +9,8 @@ import gymnasium
 import jax
 import jax.numpy as jnp
 
-from mjx_arm.env import EnvState, make
+from mjx_arm.envs.env import make
+from mjx_arm.envs.state import EnvState
 from mjx_arm.interop.gymnasium_env import observation_space
 
 try:
@@ -61,12 +62,13 @@ class GymnaxEnv(Environment):
         truncated = (too_long | transition.info["diverged"]) & ~transition.terminated
         ended = transition.terminated | truncated
         final = self.env.observe(state)
-        fresh = self.env.restart(key, state, needed=ended)
+        fresh = self.env.restart(key, state, wanted=ended)
         first = self.env.observe(fresh)
         obs, state = jax.tree.map(
             lambda a, b: jnp.where(ended, a, b), (first, fresh), (final, state)
         )
-        info = transition.info | {
+        info: dict[str, Any] = {**transition.metrics, **transition.info}
+        info |= {
             "terminated": transition.terminated,
             "truncated": truncated,
             "final_observation": final,
@@ -81,7 +83,7 @@ class GymnaxEnv(Environment):
     @property
     def name(self) -> str:
         """Name of the environment."""
-        return f"mjx_arm-{self.env.config.scene}"
+        return f"mjx_arm-{self.env.config.task}-{self.env.config.env}"
 
     @property
     def num_actions(self) -> int:

@@ -16,7 +16,7 @@ class ArmCubeVecEnv(VecEnv):
 
     A single one needs no adapter, nor do a few in a `DummyVecEnv`; these all step at once. `infos`
     have `success`, the same as `is_success`, `grasped`, `height`, `distance` and the rest of
-    `mjx_arm.env.Transition.info`.
+    the `info` of `Env.step`.
 
     Args:
       name: environment, `"A"` or `"B"`.

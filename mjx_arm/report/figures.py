@@ -19,20 +19,15 @@ _PAPER = {
     "mean_reward": "mean reward",
     "mean_max_q": "mean max Q",
 }
-_LEARNING = {
-    "success_rate": "success rate",
-    "grasp_share": "steps with the cube grasped",
-    "mean_distance": "distance gripper to cube (m)",
-    "loss": "loss",
-}
+_LEARNING = {"success_rate": "success rate", "loss": "loss"}
 
 
 def plot_curves(folders: Sequence[pathlib.Path], into: pathlib.Path) -> list[pathlib.Path]:
     """Draws the curves of run folders, one line each, as PNG files.
 
     `figure3.png` has the paper's three: cumulative successes, mean reward of a step and mean
-    maximum Q of a step, over episodes. `learning.png` has success rate, share of steps with the
-    cube grasped, distance between gripper and cube and loss, over environment steps.
+    maximum Q of a step, over episodes. `learning.png` has success rate, loss and the task's own
+    metrics over environment steps.
 
     Args:
       folders: with metrics.
@@ -47,8 +42,20 @@ def plot_curves(folders: Sequence[pathlib.Path], into: pathlib.Path) -> list[pat
     runs = [_columns(folder) for folder in folders]
     return [
         _draw(into / "figure3.png", _PAPER, "episode", runs),
-        _draw(into / "learning.png", _LEARNING, "env_steps", runs),
+        _draw(into / "learning.png", _LEARNING | _task_panels(runs[0]), "env_steps", runs),
     ]
+
+
+def _task_panels(columns: dict[str, np.ndarray]) -> dict[str, str]:
+    """Panels for the metrics of a task: shares of steps, and means."""
+    known = {*_PAPER, "mean_length", "blocked_share"}
+    panels = {}
+    for name in columns:
+        if name.endswith("_share") and name not in known:
+            panels[name] = f"{name.removesuffix('_share').replace('_', ' ')}, share of steps"
+        elif name.startswith("mean_") and name not in known:
+            panels[name] = f"mean {name.removeprefix('mean_').replace('_', ' ')}"
+    return panels
 
 
 def _columns(folder: pathlib.Path) -> dict[str, np.ndarray]:

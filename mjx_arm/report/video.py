@@ -1,4 +1,4 @@
-"""A video of a policy: the scene drawn large, and beside it what the agent sees."""
+"""A video of a policy: the scene in large, and beside it what the agent sees."""
 
 from __future__ import annotations
 
@@ -12,28 +12,40 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_arm.dqn import check_epsilon, epsilon_greedy
-from mjx_arm.env import Env
+from mjx_arm.algos.collect import act
+from mjx_arm.algos.exploration import check_epsilon
+from mjx_arm.envs.auto_reset import AutoReset
+from mjx_arm.envs.env import Env
+from mjx_arm.kinematics import make_kinematics
 from mjx_arm.physics import compiler_options
-from mjx_arm.render import make_renderer, rgb
+from mjx_arm.render import rgb
+from mjx_arm.varies import Params
 
 _EDGE = 384
 _FRAMES_PER_SECOND = 30
-# Frames drawn in one call.
+# Frames rendered in one call.
 _AT_ONCE = 50
 
 
 @dataclasses.dataclass(frozen=True)
 class Episode:
-    """One recorded episode of length `L`.
+    """One recorded episode of length `L - 1`.
 
     Attributes:
       qpos: `[L, nq] float32`, before each step and after the last.
-      success: it ended with the cube lifted.
+      max_q: `[L] float32`, the largest Q-value in each of these states.
+      params: values of the model's fields that vary by episode.
+      success: it ended in success.
     """
 
     qpos: np.ndarray
+    max_q: np.ndarray
+    params: Params
     success: bool
+
+    def __len__(self) -> int:
+        """Number of frames."""
+        return len(self.qpos)
 
 
 def record_episode(
@@ -42,7 +54,7 @@ def record_episode(
     params: Any,
     *,
     epsilon: float,
-    seed: int,
+    key: jax.Array,
 ) -> Episode:
     """Runs an epsilon-greedy policy for one episode.
 
@@ -50,58 +62,63 @@ def record_episode(
       ValueError: `epsilon` outside 0 to 1.
     """
     check_epsilon(epsilon)
+    auto = AutoReset(env)
 
-    def step(carry: tuple[Any, ...], _: None) -> tuple[tuple[Any, ...], tuple[jax.Array, ...]]:
-        state, key, running = carry
+    def step(
+        carry: tuple[Any, jax.Array, jax.Array], _: None
+    ) -> tuple[tuple[Any, jax.Array, jax.Array], tuple[jax.Array, ...]]:
+        envs, key, running = carry
         key, act_key = jax.random.split(key)
-        obs = jax.tree.map(lambda x: x[None], env.observe(state))
-        action = epsilon_greedy(act_key, apply(params, obs), jnp.float32(epsilon))[0]
-        after, transition = env.transition(state, action)
-        record = (state.physics.qpos, running, running & transition.terminated)
-        running &= ~(transition.terminated | transition.truncated)
-        return (after, key, running), record
+        obs: Any = jax.vmap(env.observe)(envs.env)
+        q = apply(params, obs)
+        _action, after, transition = act(auto, act_key, envs, q, jnp.float32(epsilon))
+        ended = (transition.terminated | transition.truncated)[0]
+        seen = (envs.env.physics.qpos[0], jnp.max(q), running)
+        return (after, key, running & ~ended), (*seen, running & transition.terminated[0])
 
-    def run(key: jax.Array) -> tuple[jax.Array, ...]:
+    def run(key: jax.Array) -> tuple[Any, ...]:
         reset_key, key = jax.random.split(key)
-        _, state = env.reset(reset_key)
-        start = (state, key, jnp.ones((), jnp.bool_))
-        (last, _, _), records = jax.lax.scan(step, start, None, length=env.config.max_steps)
-        return last.physics.qpos, *records
+        _, envs = jax.vmap(auto.reset)(reset_key[None])
+        carry = (envs, key, jnp.ones((), jnp.bool_))
+        # One step more than the longest episode: its state is the last one of the episode.
+        _, records = jax.lax.scan(step, carry, None, length=env.config.max_steps + 1)
+        return jax.tree.map(lambda x: x[0], envs.env.params), *records
 
     compiled = jax.jit(run, compiler_options=compiler_options(env.physics))
-    last, qpos, running, success = jax.device_get(compiled(jax.random.key(seed)))
-    length = int(running.sum())
-    after = qpos[length] if length < len(qpos) else last
-    return Episode(qpos=np.concatenate([qpos[:length], after[None]]), success=bool(success.any()))
+    episode_params, qpos, max_q, running, success = jax.device_get(compiled(key))
+    frames = int(running.sum()) + 1
+    return Episode(qpos[:frames], max_q[:frames], episode_params, bool(success.any()))
 
 
 def draw_episode(env: Env, episode: Episode) -> Iterator[np.ndarray]:
-    """Draws an episode: the scene with shadows, and the agent's own image, side by side.
+    """Renders an episode: the scene with shadows, and beside it what the agent sees.
 
     Yields:
-      Each of its frames, `[384, 768, 3] uint8`; drawn some at a time, for 1,000 are a gigabyte.
+      Each of its frames, `[384, 768, 3] uint8`; rendered some at a time, for 1,000 are a gigabyte.
     """
-    from mjx_arm.kinematics import make_kinematics
+    kinematics = make_kinematics(env.scene.mj_model, env.varies)
+    size = (_EDGE, _EDGE)
+    large = env.with_cameras(size=size, shadows=True)
 
-    kinematics = make_kinematics(env.scene.mj_model)
-    config = env.config
-    large = make_renderer(env.scene, camera=config.camera, size=(_EDGE, _EDGE), shadows=True)
-    small = make_renderer(env.scene, camera=config.camera, size=config.size, shadows=config.shadows)
+    def render(qpos: jax.Array) -> tuple[jax.Array, jax.Array]:
+        poses = kinematics(qpos, episode.params)
+        images = (x.render(qpos, poses, episode.params)[0] for x in (large, env))
+        scene, view = (rgb(_first_camera(image, env)) for image in images)
+        return scene, view
 
-    def draw(qpos: jax.Array) -> tuple[jax.Array, jax.Array]:
-        poses = kinematics(qpos)
-        pixels = large(poses.geom_xpos, poses.geom_xmat), small(poses.geom_xpos, poses.geom_xmat)
-        return rgb(pixels[0]), rgb(pixels[1])
-
-    draw_some = jax.jit(lambda q: jax.lax.map(draw, q))
-    rows, columns = (np.arange(_EDGE) * edge // _EDGE for edge in config.size)
+    render_some = jax.jit(lambda q: jax.lax.map(render, q))
+    rows, columns = (np.arange(_EDGE) * edge // _EDGE for edge in env.config.size)
     for start in range(0, len(episode.qpos), _AT_ONCE):
         qpos = episode.qpos[start : start + _AT_ONCE]
         # Of one length, or the last ones would compile again.
         padded = np.concatenate([qpos, np.repeat(qpos[-1:], _AT_ONCE - len(qpos), axis=0)])
-        scenes, views = jax.device_get(draw_some(padded))
+        scenes, views = jax.device_get(render_some(padded))
         for scene, view in zip(scenes[: len(qpos)], views, strict=False):
             yield np.concatenate([scene, view[rows][:, columns]], axis=1)
+
+
+def _first_camera(image: jax.Array, env: Env) -> jax.Array:
+    return image if len(env.cameras) == 1 else image[0]
 
 
 def check_video_path(path: pathlib.Path) -> None:

@@ -2,7 +2,7 @@
 
 Slot `t` of environment `n` holds what the agent saw at time `t`, what it did, and what came of it;
 what it saw next is in slot `t + 1`. With auto-reset in the next step, that also holds for the last
-frame of an episode, and only the transition across the border is void.
+frame of an episode, and only the transition across the border is masked.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ class Step:
       reward: `[N] float32`.
       terminated: `[N] bool`.
       truncated: `[N] bool`.
-      void: `[N] bool`, no transition starts here: a reset, or a simulation that diverged.
+      masked: `[N] bool`, no transition starts here: a reset, or a simulation that diverged.
     """
 
     frame: jax.Array
@@ -30,7 +30,7 @@ class Step:
     reward: jax.Array
     terminated: jax.Array
     truncated: jax.Array
-    void: jax.Array
+    masked: jax.Array
 
 
 @flax.struct.dataclass
@@ -56,7 +56,7 @@ class Batch:
       reward: `[B] float32`, discounted sum over the steps that were taken.
       next_frame: pytree of `[B, ...]`, the frame to bootstrap from.
       discount: `[B] float32`, what its value is worth; 0 after a termination.
-      weight: `[B] float32`, 0 for a void transition.
+      weight: `[B] float32`, 0 for a masked transition, whose other numbers are 0 as well.
     """
 
     frame: jax.Array
@@ -88,7 +88,7 @@ def add(replay: Replay, step: Step) -> Replay:
 
 
 def sample(replay: Replay, key: jax.Array, batch: int, n_step: int, gamma: float) -> Batch:
-    """Draws n-step transitions uniformly over slots and environments.
+    """Samples n-step transitions uniformly over slots and environments.
 
     The sum of rewards stops where an episode ends. After a truncation the value of the episode's
     true last frame counts, after a termination nothing does.
@@ -102,9 +102,9 @@ def sample(replay: Replay, key: jax.Array, batch: int, n_step: int, gamma: float
     """
     slots, num_envs = replay.steps.reward.shape
     time_key, env_key = jax.random.split(key)
-    held = jnp.minimum(replay.count, slots)
+    size = jnp.minimum(replay.count, slots)
     # The last n_step slots have no frame yet to bootstrap from.
-    age = jax.random.randint(time_key, (batch,), n_step, held)
+    age = jax.random.randint(time_key, (batch,), n_step, size)
     env = jax.random.randint(env_key, (batch,), 0, num_envs)
     start = replay.count - 1 - age
 
@@ -114,11 +114,11 @@ def sample(replay: Replay, key: jax.Array, batch: int, n_step: int, gamma: float
     steps = replay.steps
     running = jnp.ones((batch,), jnp.bool_)
     reward = jnp.zeros((batch,), jnp.float32)
-    void = jnp.zeros((batch,), jnp.bool_)
+    masked = jnp.zeros((batch,), jnp.bool_)
     terminated = jnp.zeros((batch,), jnp.bool_)
     length = jnp.zeros((batch,), jnp.int32)
     for offset in range(n_step):
-        void |= running & at(steps.void, offset)
+        masked |= running & at(steps.masked, offset)
         reward += jnp.where(running, gamma**offset * at(steps.reward, offset), 0.0)
         length += running.astype(jnp.int32)
         terminated |= running & at(steps.terminated, offset)
@@ -127,8 +127,24 @@ def sample(replay: Replay, key: jax.Array, batch: int, n_step: int, gamma: float
     return Batch(
         frame=jax.tree.map(lambda field: at(field, 0), steps.frame),
         action=at(steps.action, 0).astype(jnp.int32),
-        reward=reward,
+        reward=jnp.where(masked, 0.0, reward),
         next_frame=jax.tree.map(lambda field: at(field, length), steps.frame),
-        discount=jnp.where(terminated, 0.0, discount),
-        weight=(~void).astype(jnp.float32),
+        discount=jnp.where(terminated | masked, 0.0, discount),
+        weight=(~masked).astype(jnp.float32),
     )
+
+
+def sample_frames(replay: Replay, key: jax.Array, batch: int) -> jax.Array:
+    """Samples frames uniformly over slots and environments: pytree of `[B, ...]`.
+
+    Args:
+      replay: holds at least one time step.
+      key: consumed.
+      batch: number of frames `B`.
+    """
+    slots, num_envs = replay.steps.reward.shape
+    time_key, env_key = jax.random.split(key)
+    age = jax.random.randint(time_key, (batch,), 0, jnp.minimum(replay.count, slots))
+    env = jax.random.randint(env_key, (batch,), 0, num_envs)
+    slot = (replay.count - 1 - age) % slots
+    return jax.tree.map(lambda field: field[slot, env], replay.steps.frame)

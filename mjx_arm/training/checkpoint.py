@@ -16,7 +16,7 @@ from typing import Any
 
 import jax
 
-from mjx_arm.memory import tree_size
+from mjx_arm.training.memory import tree_size
 
 _KEPT = 2
 _DIGITS = 12
@@ -174,7 +174,7 @@ class RunCheckpoints:
         """
         steps = self.steps()
         if not steps:
-            raise ValueError(f"{self.folder} holds no checkpoint to go on from")
+            raise ValueError(f"{self.folder} holds no checkpoint to continue from")
         try:
             check_tree(self._path(steps[-1]), like)
             return steps[-1]
@@ -185,7 +185,7 @@ class RunCheckpoints:
                 except ValueError:
                     continue
                 raise ValueError(
-                    f"{error}; remove it to go on from the one before, {step:0{_DIGITS}d}"
+                    f"{error}; remove it to continue from the one before, {step:0{_DIGITS}d}"
                 ) from error
             raise
 

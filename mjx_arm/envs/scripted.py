@@ -11,8 +11,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_arm.env import Env, EnvState
-from mjx_arm.task import CLOSE, OPEN, grasped
+from mjx_arm.envs.env import Env
+from mjx_arm.envs.state import EnvState
+from mjx_arm.envs.tasks.lift import Lift, grasped
 
 # Ways and distances of the plan, m.
 _HOVER = 0.09
@@ -39,23 +40,29 @@ def make_scripted_policy(env: Env) -> Callable[[EnvState], jax.Array]:
 
     Returns:
       A pure function from a state to `[] int32`; jit- and vmap-able.
+
+    Raises:
+      ValueError: the environment has another task than `lift`.
     """
-    ids, solve = env.ids, _make_inverse_kinematics(env)
+    task, arm = env.task, env.arm
+    if not isinstance(task, Lift):
+        raise ValueError(f"the scripted policy lifts cubes; the task is {env.config.task!r}")
+    solve = _make_inverse_kinematics(env)
     step = np.float32(np.deg2rad(env.config.degrees_per_action))
-    shut = ids.ctrl_range[ids.gripper_ctrl, 0]
-    top = np.float32(env.config.lift + ids.cube_half_size + _LIFT_MARGIN)
+    shut = arm.ctrl_range[arm.gripper_ctrl, 0]
+    top = np.float32(task.config.lift + task.half_size + _LIFT_MARGIN)
 
     def policy(state: EnvState) -> jax.Array:
         poses, qpos = state.physics.poses, state.physics.qpos
-        gripper = poses.site_xpos[ids.grasp_site]
-        cube = poses.geom_xpos[ids.cube_geom]
-        held = grasped(env.scene.mj_model, ids, poses, state.ctrl)
+        gripper = poses.site_xpos[arm.grasp_site]
+        cube = poses.geom_xpos[task.cube_geom]
+        held = grasped(task, poses, state.ctrl)
         offset = gripper - cube
         aside = jnp.sqrt(jnp.sum(jnp.square(offset[:2])))
         target = jnp.where(held, _raised(gripper, top), _above(gripper, cube, aside))
-        joints = state.ctrl[ids.arm_ctrl]
+        joints = state.ctrl[arm.ctrl]
         yaw = jnp.arctan2(
-            poses.geom_xmat[ids.cube_geom, 1, 0], poses.geom_xmat[ids.cube_geom, 0, 0]
+            poses.geom_xmat[task.cube_geom, 1, 0], poses.geom_xmat[task.cube_geom, 0, 0]
         )
         error = (solve(target, yaw, joints, held) - joints) / step
         away = jnp.abs(error) > _REACHED
@@ -68,12 +75,11 @@ def make_scripted_policy(env: Env) -> Callable[[EnvState], jax.Array]:
         turn = 2 * joint + (error[joint] > 0).astype(jnp.int32)
         reached = ~jnp.any(away)
         at_cube = (aside < _ALIGNED) & (offset[2] < _AT_CUBE)
-        commanded_shut = state.ctrl[ids.gripper_ctrl] < ids.cube_half_size
-        missed = commanded_shut & (jnp.max(qpos[ids.finger_qpos]) < shut + _MISSED)
-        close = (at_cube & reached) | (commanded_shut & ~missed)
-        return jnp.where(held, turn, jnp.where(missed, OPEN, jnp.where(close, CLOSE, turn))).astype(
-            jnp.int32
-        )
+        closing = state.ctrl[arm.gripper_ctrl] < task.half_size
+        missed = closing & (jnp.max(qpos[arm.finger_qpos]) < shut + _MISSED)
+        close = (at_cube & reached) | (closing & ~missed)
+        grip = jnp.where(missed, arm.open_action, jnp.where(close, arm.close_action, turn))
+        return jnp.where(held, turn, grip).astype(jnp.int32)
 
     return policy
 
@@ -97,7 +103,7 @@ def _make_inverse_kinematics(
 ) -> Callable[[jax.Array, jax.Array, jax.Array, jax.Array], jax.Array]:
     """Closed form for the gripper pointing straight down."""
     model = env.scene.mj_model
-    joints = [model.actuator_trnid[i, 0] for i in env.ids.arm_ctrl]
+    joints = [model.actuator_trnid[i, 0] for i in env.arm.ctrl]
     bodies = model.jnt_bodyid[joints]
     pos = model.body_pos
     shoulder = pos[bodies[0], 2] + pos[bodies[1], 2]
@@ -105,7 +111,7 @@ def _make_inverse_kinematics(
     upper_length = float(np.hypot(upper[0], upper[2]))
     upper_tilt = float(np.arctan2(upper[0], upper[2]))
     forearm = float(pos[bodies[3], 0] + pos[bodies[4], 0])
-    tool = pos[bodies[5], 0] + model.site_pos[env.ids.grasp_site, 0]
+    tool = pos[bodies[5], 0] + model.site_pos[env.arm.grasp_site, 0]
 
     def solve(target: jax.Array, yaw: jax.Array, joints: jax.Array, held: jax.Array) -> jax.Array:
         radius = jnp.sqrt(jnp.sum(jnp.square(target[:2])))

@@ -1,4 +1,4 @@
-"""Large batches in parts that fit a CPU's cache."""
+"""Large batches, computed in microbatches that fit a CPU's cache."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ import jax
 _ROWS = 64
 
 
-def in_parts(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
-    """The same function of a batch, worked on 64 rows at a time where they are a multiple of that.
+def microbatched(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    """The same function of a batch, applied to 64 rows at a time if their number allows it.
 
-    On CPU only: drawing or judging 4,096 images at once takes twice as long there as 64 times 64.
+    On a CPU only, where rendering 4,096 images at once takes twice as long as 64 times 64 images.
 
     Args:
       function: maps a tree of arrays `[N, ...]` to one of arrays `[N, ...]`, each row by itself.
@@ -31,14 +31,14 @@ def in_parts(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
     return apply
 
 
-def overwrite_in_parts(function: Callable[[Any], Any], batch: Any, old: Any) -> Any:
-    """`in_parts(function)(batch)`, written over `old`.
+def overwrite_microbatched(function: Callable[[Any], Any], batch: Any, old: Any) -> Any:
+    """`microbatched(function)(batch)`, written over `old`.
 
-    For the carry of a scan: a result of its own would be filled with zeros first, copied into the
-    carry last, and held beside it.
+    For the carry of a scan: a separate result would be filled with zeros first, copied into the
+    carry last, and take memory beside it.
 
     Args:
-      function: as in `in_parts`.
+      function: as in `microbatched`.
       batch: tree of arrays `[N, ...]`.
       old: tree with the shapes and dtypes of the result; its values do not matter.
     """

@@ -9,7 +9,8 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 
-from mjx_arm.env import Env, EnvState, Observation, Transition
+from mjx_arm.envs.env import Env
+from mjx_arm.envs.state import EnvState, Observation, Transition
 
 T = TypeVar("T")
 
@@ -41,7 +42,7 @@ class AutoReset:
     returns the first observation of the next one, and the true last observation in
     `info["final_observation"]`, which is there at every step.
 
-    A start is drawn anew each time, and is handed what outlives an episode; see `Env.restart`.
+    Each start is sampled anew, and gets what outlives an episode; see `Env.restart`.
 
     Attributes:
       env: the environment.
@@ -78,7 +79,7 @@ class AutoReset:
             transition.reward,
             transition.terminated,
             transition.truncated,
-            transition.info,
+            transition.metrics | transition.info,
         )
 
     def transition(
@@ -86,7 +87,7 @@ class AutoReset:
     ) -> tuple[AutoResetState, Transition]:
         """A `next_step` step without its observation."""
         stepped, transition = self.env.transition(state.env, action)
-        fresh = self.env.restart(key, state.env, needed=state.ended)
+        fresh = self.env.restart(key, state.env, wanted=state.ended)
         blank = jax.tree.map(jnp.zeros_like, transition)
         transition = _select(state.ended, blank, transition)
         transition.info["reset"] = state.ended
@@ -98,10 +99,11 @@ class AutoReset:
     ) -> tuple[Observation, AutoResetState, jax.Array, jax.Array, jax.Array, dict[str, Any]]:
         stepped, transition = self.env.transition(state.env, action)
         ended = transition.terminated | transition.truncated
-        fresh = self.env.restart(key, stepped, needed=ended)
+        fresh = self.env.restart(key, stepped, wanted=ended)
         final = self.env.observe(stepped)
         obs = _select(ended, self.env.observe(fresh), final)
-        info = transition.info | {"reset": ended, "final_observation": final}
+        info: dict[str, Any] = {**transition.metrics, **transition.info}
+        info |= {"reset": ended, "final_observation": final}
         state = AutoResetState(env=_select(ended, fresh, stepped), ended=state.ended)
         return obs, state, transition.reward, transition.terminated, transition.truncated, info
 

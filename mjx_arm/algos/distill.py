@@ -1,0 +1,234 @@
+"""Distillation: a student that sees pixels learns from a teacher that sees the simulator's state.
+
+Both learn in the same scan and from the same replay. The teacher learns by deep Q-learning from
+state features. The student's target in a state is the teacher's Q-values there: all of them, not
+only that of the action taken. What is judged and saved is the student, which never sees the state.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+import chex
+import flax.struct
+import jax
+import jax.numpy as jnp
+import optax
+
+from mjx_arm.algos.dqn import Learner, QLearning, first_update, num_microbatches, update_when
+from mjx_arm.algos.frames import Frame, Frames, Obs
+from mjx_arm.algos.replay import Replay, sample, sample_frames
+from mjx_arm.config import DistillConfig
+
+Params = Any
+
+_TEACHER_METRICS: dict[str, str] = dict.fromkeys(("loss", "q_mean", "target_max"), "updates")
+_STUDENT_METRICS: dict[str, str] = dict.fromkeys(
+    ("student_loss", "student_agreement"), "student_updates"
+)
+
+# Environment steps between the student's first update and the first step that it drives.
+_WARM_UP = 100_000
+# The spread of the teacher's advantages is averaged over about this number of updates.
+_SPREAD_UPDATES = 1_000
+# Weight of the squared error of the mean Q-value beside the cross-entropy.
+_VALUE_WEIGHT = 0.1
+
+
+@flax.struct.dataclass
+class Student:
+    """What the student's learning changes.
+
+    Attributes:
+      params: of its network.
+      opt_state: of the optimizer.
+      averaged: parameters averaged over the updates, which act and are judged.
+      spread: `[] float32`, running root mean square of the teacher's advantages.
+    """
+
+    params: Params
+    opt_state: optax.OptState
+    averaged: Params
+    spread: jax.Array
+
+
+@flax.struct.dataclass
+class Pair:
+    """Teacher and student."""
+
+    teacher: Learner
+    student: Student
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Distill:
+    """A privileged teacher and its student as an `Algorithm`.
+
+    Attributes:
+      config: the options.
+      frames: what the student sees, and what the replay stores: with the state features.
+      teacher: Q-learning from the state features.
+      network: the student's Flax module, `pixels [B, ...] -> Q-values [B, A]`.
+      num_envs: environments that run side by side.
+    """
+
+    config: DistillConfig
+    frames: Frames
+    teacher: QLearning
+    network: Any
+    num_envs: int
+    metrics: Mapping[str, str] = dataclasses.field(
+        default_factory=lambda: _TEACHER_METRICS | _STUDENT_METRICS
+    )
+
+    def init(self, key: jax.Array, obs: Obs, frame: Frame) -> Pair:
+        """Fresh networks; see `Algorithm`."""
+        teacher_key, student_key = jax.random.split(key)
+        params = self.init_policy(student_key, obs)
+        student = Student(
+            params=params,
+            opt_state=self._optimizer.init(params),
+            averaged=jax.tree.map(jnp.copy, params),
+            # Before the first target is seen; about that of rewards below 1.
+            spread=jnp.full((), 0.05, jnp.float32),
+        )
+        return Pair(self.teacher.init(teacher_key, self.frames.features(frame)), student)
+
+    def init_policy(self, key: jax.Array, obs: Obs) -> Params:
+        """Fresh parameters of the student. Consumes the key."""
+        params: Params = self.network.init(key, obs)
+        return params
+
+    @property
+    def _optimizer(self) -> optax.GradientTransformation:
+        return optax.adam(self.config.student_learning_rate)
+
+    def acts_on_obs(self, env_steps: jax.Array) -> jax.Array:
+        """Whether the student drives its share of the environments already."""
+        return env_steps >= self.config.student_starts + _WARM_UP
+
+    def q_values(self, pair: Pair, obs: Obs, frame: Frame, env_steps: jax.Array) -> jax.Array:
+        """The student's Q-values where it drives, the teacher's in the other environments."""
+        features = self.frames.features(frame)
+        of_teacher = self.teacher.apply(pair.teacher.params, features)
+        driven = round(self.config.student_share * self.num_envs)
+
+        def mixed() -> jax.Array:
+            of_student = self.apply(pair.student.averaged, obs)
+            # Evenly among the environments, whose shares of random actions rise.
+            index = jnp.arange(self.num_envs)
+            mask = (index + 1) * driven // self.num_envs > index * driven // self.num_envs
+            return jnp.where(mask[:, None], of_student, of_teacher)
+
+        return jax.lax.cond(self.acts_on_obs(env_steps), mixed, lambda: of_teacher)
+
+    def policy(self, pair: Pair) -> Params:
+        """The student's averaged parameters."""
+        return pair.student.averaged
+
+    def with_policy(self, pair: Pair, params: Params) -> Pair:
+        """The pair with these parameters of the student; the teacher is as it was."""
+        averaged = jax.tree.map(jnp.copy, params)
+        student = dataclasses.replace(pair.student, params=params, averaged=averaged)
+        return dataclasses.replace(pair, student=student)
+
+    def apply(self, params: Params, obs: Obs) -> jax.Array:
+        """Q-values of the student, `[N, A] float32`."""
+        q: jax.Array = self.network.apply(params, obs)
+        return q
+
+    def learn(
+        self, key: jax.Array, pair: Pair, replay: Replay, env_steps: jax.Array
+    ) -> tuple[Pair, dict[str, jax.Array]]:
+        """One update of the teacher and several of the student, each from its start on."""
+        config = self.config
+        teacher_key, student_key = jax.random.split(key)
+
+        def teach(learner: Learner, key: jax.Array) -> tuple[Learner, dict[str, jax.Array]]:
+            size = config.teacher_batch_size
+            batch = sample(replay, key, size, config.n_step, config.gamma)
+            features = self.frames.features
+            return self.teacher.update(
+                learner, batch, features(batch.frame), features(batch.next_frame)
+            )
+
+        ready = replay.count > first_update(config, self.num_envs)
+        teacher, taught = update_when(ready, teach, teacher_key, pair.teacher, 1, _TEACHER_METRICS)
+
+        def imitate(student: Student, key: jax.Array) -> tuple[Student, dict[str, jax.Array]]:
+            frame = sample_frames(replay, key, config.student_batch_size)
+            target = self.teacher.apply(teacher.target_params, self.frames.features(frame))
+            return self.imitate(student, self.frames.decode(frame), target)
+
+        student, learned = update_when(
+            ready & (env_steps >= config.student_starts),
+            imitate,
+            student_key,
+            pair.student,
+            config.student_updates_per_step,
+            _STUDENT_METRICS,
+        )
+        return Pair(teacher, student), taught | learned
+
+    def imitate(
+        self, student: Student, obs: Obs, target: jax.Array
+    ) -> tuple[Student, dict[str, jax.Array]]:
+        """One update of the student.
+
+        Args:
+          student: before.
+          obs: `[B, ...]`.
+          target: `[B, A] float32`, the teacher's Q-values.
+
+        Returns:
+          The student after, its loss, and the share of the states in which both prefer the same
+          action.
+        """
+        advantage = target - jnp.mean(target, axis=-1, keepdims=True)
+        power = jnp.mean(jnp.square(advantage))
+        rate = 1.0 / _SPREAD_UPDATES
+        spread = (1 - rate) * student.spread + rate * jnp.sqrt(power + 1e-10)
+        parts = num_microbatches(len(target))
+        rows = jax.tree.map(lambda x: x.reshape(parts, -1, *x.shape[1:]), (obs, target))
+        temperature = self.config.student_temperature * spread
+
+        def loss_of(params: Params, obs: Obs, target: jax.Array) -> tuple[jax.Array, jax.Array]:
+            q = self.apply(params, obs)
+            losses = jax.vmap(imitation_loss, in_axes=(0, 0, None))(q, target, temperature)
+            agree = jnp.argmax(q, axis=-1) == jnp.argmax(target, axis=-1)
+            return jnp.mean(losses), jnp.mean(agree.astype(jnp.float32))
+
+        def add(grads: Params, row: tuple[Obs, jax.Array]) -> tuple[Params, Any]:
+            values, own = jax.value_and_grad(loss_of, has_aux=True)(student.params, *row)
+            return jax.tree.map(jnp.add, grads, own), values
+
+        zeros = jax.tree.map(jnp.zeros_like, student.params)
+        grads, (losses, agreements) = jax.lax.scan(add, zeros, rows)
+        grads = jax.tree.map(lambda x: x / parts, grads)
+        # Adam's bias correction raises a float to an integer power; strict promotion is for ours.
+        with jax.numpy_dtype_promotion("standard"):
+            changes, opt_state = self._optimizer.update(grads, student.opt_state, student.params)
+        params = optax.apply_updates(student.params, changes)
+        averaged = optax.incremental_update(params, student.averaged, self.config.student_polyak)
+        metrics = {"student_loss": jnp.mean(losses), "student_agreement": jnp.mean(agreements)}
+        return Student(params, opt_state, averaged, spread), metrics
+
+
+def imitation_loss(q: jax.Array, target: jax.Array, temperature: jax.Array) -> jax.Array:
+    """Loss of one state, `[] float32`.
+
+    Cross-entropy between the softmax of both networks' advantages, plus a tenth of the squared
+    error of the mean Q-value, which the softmax does not see: so Q-values stay Q-values.
+
+    Args:
+      q: `[A] float32`, of the student.
+      target: `[A] float32`, of the teacher.
+      temperature: `[] float32`, in units of a Q-value.
+    """
+    chex.assert_rank([q, target, temperature], [1, 1, 0])
+    value, target_value = jnp.mean(q), jnp.mean(target)
+    logits, target_logits = (q - value) / temperature, (target - target_value) / temperature
+    entropy = optax.losses.softmax_cross_entropy(logits, jax.nn.softmax(target_logits))
+    return entropy + _VALUE_WEIGHT * jnp.square(value - target_value)

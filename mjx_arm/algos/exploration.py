@@ -1,0 +1,50 @@
+"""Epsilon-greedy exploration: its schedule, and each environment's share of random actions."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+
+from mjx_arm.config import ExplorationConfig
+
+
+def epsilon_at(config: ExplorationConfig, env_steps: jax.Array) -> jax.Array:
+    """Share of random actions after a number of environment steps, `[] float32`."""
+    schedule = optax.schedules.linear_schedule(
+        config.epsilon_start, config.epsilon_end, config.epsilon_steps
+    )
+    return jnp.asarray(schedule(env_steps.astype(jnp.float32)), jnp.float32)
+
+
+def spread_epsilon(config: ExplorationConfig, epsilon: jax.Array, num_envs: int) -> jax.Array:
+    """The share of each environment, `[num_envs] float32`.
+
+    Their mean is `epsilon`, but for those that would be above 1 and are cut to 1.
+    """
+    spread = config.epsilon_spread if num_envs > 1 else 1.0
+    ratios = np.geomspace(1 / spread, spread, num_envs)
+    return jnp.minimum(epsilon * jnp.asarray(ratios / ratios.mean(), jnp.float32), 1.0)
+
+
+def check_epsilon(epsilon: float) -> None:
+    """Refuses what is not a share of random actions.
+
+    Raises:
+      ValueError: it is not from 0 to 1.
+    """
+    if not 0.0 <= epsilon <= 1.0:
+        raise ValueError(f"epsilon must be from 0 to 1, got {epsilon}")
+
+
+def epsilon_greedy(key: jax.Array, q: jax.Array, epsilon: jax.Array) -> jax.Array:
+    """Actions for Q-values `[N, A] float32`, `[N] int32`; consumes the key.
+
+    Each is uniformly random with probability `epsilon`, `[] or [N] float32`, else the best.
+    """
+    explore_key, action_key = jax.random.split(key)
+    num_envs, num_actions = q.shape
+    explore = jax.random.uniform(explore_key, (num_envs,)) < epsilon
+    random = jax.random.randint(action_key, (num_envs,), 0, num_actions)
+    return jnp.where(explore, random, jnp.argmax(q, axis=-1).astype(jnp.int32))

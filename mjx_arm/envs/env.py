@@ -1,0 +1,313 @@
+"""The environment: reset, step and observe, pure and for a single environment.
+
+`env.step` never resets; `mjx_arm.envs.auto_reset` does.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mjx_arm.envs.arm import Arm, apply_action, arm_feature_scales, arm_features, resolve_arm
+from mjx_arm.envs.collision import Clearance, make_clearance
+from mjx_arm.envs.config import EnvConfig, env_config
+from mjx_arm.envs.starts import StartSampler
+from mjx_arm.envs.state import EnvState, Observation, Placement, Snapshot, Transition
+from mjx_arm.envs.tasks import find_task
+from mjx_arm.envs.tasks.base import Reward, Task
+from mjx_arm.kinematics import Poses, make_camera_pose, make_kinematics
+from mjx_arm.options import check_name
+from mjx_arm.physics import Physics, make_physics
+from mjx_arm.references import is_reference, load_reference, reference_to
+from mjx_arm.render import make_renderer, rgb, segmentation
+from mjx_arm.scene import Scene, load_scene
+from mjx_arm.varies import Params, Varies, check_varies
+
+# `(qpos, poses, params)` -> packed pixels, and with depth the z-depth.
+Camera = Callable[[jax.Array, Poses, Params], tuple[jax.Array, ...]]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Env:
+    """A robot arm with a task; made by `mjx_arm.make`.
+
+    Attributes:
+      config: the options.
+      scene: the compiled scene.
+      arm: the arm in it.
+      task: the task.
+      reward: computes the terms of the reward.
+      physics: the backend's functions.
+      starts: samples the starts of episodes.
+      clearance: whether the arm is free of itself, its base and the ground.
+      varies: which rows of the model's fields vary by episode.
+      cameras: renders the image of each camera.
+    """
+
+    config: EnvConfig
+    scene: Scene
+    arm: Arm
+    task: Task
+    reward: Reward
+    physics: Physics
+    starts: StartSampler
+    clearance: Clearance
+    varies: Varies
+    cameras: tuple[Camera, ...]
+
+    @property
+    def num_actions(self) -> int:
+        """Number of discrete actions."""
+        return self.arm.num_actions
+
+    @property
+    def feature_scales(self) -> tuple[float, ...]:
+        """Factors that bring the state features to a size of about 1."""
+        return (*arm_feature_scales(self.arm), *self.task.feature_scales)
+
+    def reset(self, key: jax.Array) -> tuple[Observation, EnvState]:
+        """Starts an episode that owes nothing to an earlier one. Consumes the key.
+
+        Returns:
+          The observation and the state.
+        """
+        placement_key, start_key = jax.random.split(key)
+        state = self._start(start_key, self._sample_placement(placement_key), True)
+        return self.observe(state), state
+
+    def restart(self, key: jax.Array, state: EnvState, wanted: jax.Array | bool = True) -> EnvState:
+        """Starts the next episode, with what outlives the last one. Consumes the key.
+
+        Args:
+          key: a PRNG key.
+          state: the last state of the episode that has ended.
+          wanted: `[] bool`; where false the result means nothing, and costs less.
+
+        Returns:
+          The state that the next episode starts from.
+        """
+        placement_key, start_key = jax.random.split(key)
+        placement = self._sample_placement(placement_key)
+        if self.config.placed == "after_success":
+            placement = jax.tree.map(
+                lambda new, old: jnp.where(state.success, new, old), placement, state.placement
+            )
+        return self._start(start_key, placement, wanted)
+
+    def step(
+        self, key: jax.Array, state: EnvState, action: jax.Array | int
+    ) -> tuple[Observation, EnvState, jax.Array, jax.Array, jax.Array, dict[str, jax.Array]]:
+        """Advances by one iteration; never resets.
+
+        Args:
+          key: not consumed, the physics being deterministic; there for the common interface.
+          state: the state before.
+          action: `[] int32`, 0 to `num_actions - 1`.
+
+        Returns:
+          observation, state, reward, terminated, truncated and info. `info` has the task's metrics
+          (for `lift`: `grasped`, `height`, `distance`), `success`, `diverged` and `blocked`, and
+          the terms of the reward, `reward_*`.
+
+        Raises:
+          ValueError: the action is known when called, and is not one of the actions.
+        """
+        del key
+        state, transition = self.transition(state, action)
+        return (
+            self.observe(state),
+            state,
+            transition.reward,
+            transition.terminated,
+            transition.truncated,
+            transition.metrics | transition.info,
+        )
+
+    def transition(self, state: EnvState, action: jax.Array | int) -> tuple[EnvState, Transition]:
+        """Advances by one iteration without rendering an observation; see `step`."""
+        self._check_action(action)
+        config = self.config
+        action = jnp.asarray(action, jnp.int32)
+        wanted = apply_action(
+            self.arm, state.ctrl, action, config.degrees_per_action, config.millimetres_per_action
+        )
+        blocked = self.clearance.blocks(state.physics.qpos, state.ctrl, wanted)
+        ctrl = jnp.where(blocked, state.ctrl, wanted)
+        physics = self.physics.step(state.physics, ctrl, state.params)
+        after = dataclasses.replace(state, physics=physics, ctrl=ctrl, step=state.step + 1)
+        then = Snapshot(after, self.task.measure(after))
+        terms = self.reward(Snapshot(state, self.task.measure(state)), then, action)
+        terms = {name: config.reward_scale * term for name, term in terms.items()}
+        success = then.measured["success"]
+        info = {
+            "success": success,
+            "diverged": physics.diverged,
+            "blocked": blocked,
+            **{f"reward_{name}": term for name, term in terms.items()},
+        }
+        too_long = after.step >= config.max_steps
+        return dataclasses.replace(after, success=success), Transition(
+            reward=sum(terms.values(), start=jnp.zeros((), jnp.float32)),
+            terminated=success,
+            truncated=(too_long | physics.diverged) & ~success,
+            metrics={name: x for name, x in then.measured.items() if name != "success"},
+            info=info,
+        )
+
+    def observe(self, state: EnvState) -> Observation:
+        """What the agent sees of a state.
+
+        Returns:
+          By `config.observation`: `"rgb"` `[H, W, 3] uint8`; `"rgbd"` a dict of that and `"depth"`
+          `[H, W] float32`, m, infinite where nothing is hit; `"segmentation"` `[H, W] int32`, geom
+          ids, -1 where nothing is hit; `"packed"` `[H, W] uint32`; `"state"` `[F] float32`, the
+          state features. With several cameras images have a leading axis of cameras.
+        """
+        kind = self.config.observation
+        if kind == "state":
+            return self.features(state)
+        image = self.render(state.physics.qpos, state.physics.poses, state.params)
+        if kind == "rgb":
+            return rgb(image[0])
+        if kind == "segmentation":
+            return segmentation(image[0])
+        if kind == "rgbd":
+            return {"rgb": rgb(image[0]), "depth": image[1]}
+        return image[0]
+
+    def render(self, qpos: jax.Array, poses: Poses, params: Params) -> tuple[jax.Array, ...]:
+        """Packed pixels `[H, W] uint32`, and for `"rgbd"` the depth; see `observe`."""
+        images = [camera(qpos, poses, params) for camera in self.cameras]
+        if len(images) == 1:
+            return images[0]
+        return tuple(jnp.stack(arrays) for arrays in zip(*images, strict=True))
+
+    def with_cameras(self, **options: Any) -> Env:
+        """The same environment with other images, such as `size=(256, 256), shadows=True`."""
+        config = dataclasses.replace(self.config, **options)
+        cameras = [_make_camera(self.scene, name, config, self.varies) for name in config.cameras]
+        return dataclasses.replace(self, config=config, cameras=tuple(cameras))
+
+    def features(self, state: EnvState) -> jax.Array:
+        """State features, `[F] float32`: those of `arm_features`, then the task's."""
+        site = state.physics.poses.site_xpos[self.arm.grasp_site]
+        arm = arm_features(self.arm, state.physics.qpos, state.ctrl, site)
+        return jnp.concatenate([arm, self.task.features(state)])
+
+    def _sample_placement(self, key: jax.Array) -> Placement:
+        if self.config.placed == "fixed":
+            return self.task.fixed_placement()
+        return self.task.sample_placement(key)
+
+    def _start(self, key: jax.Array, placement: Placement, wanted: jax.Array | bool) -> EnvState:
+        qpos, ctrl, params, samples = self.starts.sample(key, placement, wanted)
+        return EnvState(
+            physics=self.physics.init(qpos, ctrl, params),
+            ctrl=ctrl,
+            step=jnp.zeros((), jnp.int32),
+            params=params,
+            placement=placement,
+            success=jnp.zeros((), jnp.bool_),
+            start_samples=samples,
+        )
+
+    def _check_action(self, action: jax.Array | int) -> None:
+        if isinstance(action, jax.core.Tracer):
+            return
+        values, last = np.asarray(action), self.num_actions - 1
+        whole = np.issubdtype(values.dtype, np.integer) and values.shape == ()
+        if not whole or not 0 <= int(values) <= last:
+            raise ValueError(f"action must be one whole number from 0 to {last}, got {action}")
+
+
+def make(env: str = "A", *, reward: str | Reward = "", **options: Any) -> Env:
+    """Makes environment `"A"` or `"B"` of a task.
+
+    Args:
+      env: `"A"`, everything constant, or `"B"`, joints and objects varied.
+      reward: a reward of the task by name, `"module:function"`, or a function
+        `reward(before, after, action)` of two `Snapshot` and the action, `[] int32`, that returns
+        named terms, each `[] float32`.
+      **options: fields of `EnvConfig` and of the task's own options, such as `task`, `physics`,
+        `observation`, `size`.
+
+    Returns:
+      The environment.
+
+    Raises:
+      ValueError: an unknown option, a value that an option does not take, or a scene that does not
+        have what arm and task need.
+    """
+    if callable(reward):
+        config = env_config(env, reward=reference_to(reward), **options)
+        return make_env(config, reward=reward)
+    return make_env(env_config(env, reward=reward, **options))
+
+
+def make_env(config: EnvConfig, *, reward: Reward | None = None) -> Env:
+    """Makes the environment of a configuration; see `make`.
+
+    Args:
+      config: the options.
+      reward: the function that `config.reward` names; by default it is imported.
+    """
+    scene = load_scene(config.scene_name)
+    arm = resolve_arm(scene)
+    task = find_task(config.task).make(config.task_options, scene, arm)
+    model, varies = scene.mj_model, task.varies
+    check_varies(model, varies)
+    clearance = make_clearance(model, arm)
+    return Env(
+        config=config,
+        scene=scene,
+        arm=arm,
+        task=task,
+        reward=_find_reward(config, task) if reward is None else reward,
+        physics=make_physics(
+            model,
+            config.physics,
+            substeps=scene.substeps,
+            mjx_iterations=scene.mjx_iterations,
+            varies=varies,
+        ),
+        starts=StartSampler(arm, task, clearance, make_kinematics(model, varies), config),
+        clearance=clearance,
+        varies=varies,
+        cameras=tuple(_make_camera(scene, name, config, varies) for name in config.cameras),
+    )
+
+
+def _find_reward(config: EnvConfig, task: Task) -> Reward:
+    if is_reference(config.reward):
+        reward: Reward = load_reference(config.reward, "reward")
+        return reward
+    name = config.reward or next(iter(task.rewards))
+    check_name("reward", name, task.rewards)
+    return task.rewards[name]
+
+
+def _make_camera(scene: Scene, name: str, config: EnvConfig, varies: Varies) -> Camera:
+    """Renders what one camera sees; a camera on a moving body is moved with it."""
+    render: Any = make_renderer(
+        scene,
+        camera=name,
+        size=config.size,
+        shadows=config.shadows,
+        depth=config.observation == "rgbd",
+        varies=varies,
+    )
+    pose = None
+    if scene.mj_model.body_weldid[scene.mj_model.camera(name).bodyid[0]] != 0:
+        pose = make_camera_pose(scene.mj_model, name, varies)
+
+    def camera(qpos: jax.Array, poses: Poses, params: Params) -> tuple[jax.Array, ...]:
+        moved = None if pose is None else pose(qpos, params)
+        image = render(poses.geom_xpos, poses.geom_xmat, params, moved)
+        return image if isinstance(image, tuple) else (image,)
+
+    return camera

@@ -1,0 +1,77 @@
+"""The tasks, by name; `register` adds a user's own."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+from mjx_arm.envs.tasks.base import Task, TaskConfig
+from mjx_arm.envs.tasks.lift import Lift, LiftConfig
+from mjx_arm.options import check_name
+from mjx_arm.references import is_reference, load_module
+
+
+@dataclasses.dataclass(frozen=True)
+class TaskEntry:
+    """A registered task.
+
+    Attributes:
+      make: `(config, scene, arm) -> Task`.
+      config: the class of its options.
+      scene: name or path of the scene that it takes by default.
+    """
+
+    make: Callable[..., Task]
+    config: type[TaskConfig]
+    scene: str
+
+
+_tasks: dict[str, TaskEntry] = {}
+
+
+def register(
+    name: str,
+    make: Callable[..., Task],
+    *,
+    config: type[TaskConfig] = TaskConfig,
+    scene: str = "arm_cube",
+) -> None:
+    """Makes a task known by a name, for `make`, configurations and the command line.
+
+    Args:
+      name: a new name.
+      make: `(config, scene, arm) -> Task`, such as the task's class.
+      config: the class of the task's options, made by `mjx_arm.options.options`.
+      scene: name or path of the scene that the task takes by default.
+
+    Raises:
+      ValueError: the name is taken by another task.
+    """
+    entry = TaskEntry(make, config, scene)
+    if name in _tasks and _tasks[name] != entry:
+        raise ValueError(f"the task {name!r} is registered already: give another name")
+    _tasks[name] = entry
+
+
+def find_task(name: str) -> TaskEntry:
+    """The registered task of a name, or of `module:name`, where importing the module registers it.
+
+    Raises:
+      ValueError: no task has this name, or the module cannot be imported.
+    """
+    if is_reference(name):
+        module, _, name = name.partition(":")
+        load_module(module, "task")
+    check_name("task", name, _tasks)
+    return _tasks[name]
+
+
+def task_names() -> list[str]:
+    """Names of all registered tasks."""
+    return list(_tasks)
+
+
+register("lift", Lift, config=LiftConfig)
+
+__all__: list[Any] = ["Task", "TaskConfig", "TaskEntry", "find_task", "register", "task_names"]

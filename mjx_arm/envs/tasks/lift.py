@@ -1,0 +1,282 @@
+"""The task of James & Johns 2016: grasp the cube and lift it by 30 cm."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Mapping
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jax.scipy.spatial.transform import Rotation
+
+from mjx_arm.envs.arm import Arm
+from mjx_arm.envs.state import EnvState, Snapshot
+from mjx_arm.envs.tasks.base import Obstacle, Reward, TaskConfig, rectangle
+from mjx_arm.kinematics import Poses, make_kinematics
+from mjx_arm.options import Positive, options
+from mjx_arm.scene import Scene
+from mjx_arm.varies import Params, Varies
+
+_CUBE = "cube"
+_SQUEEZE = 0.0005
+# A pad presses where it is inside the cube, contacts being soft; this much is rounding.
+_TOUCH = 1e-5
+
+
+@options
+class LiftConfig(TaskConfig):
+    """Options of the task `lift`. Where the paper names no unit, the unit is our choice.
+
+    The reward `paper` is Algorithm 1 of James & Johns 2016: `success_reward` once, else
+    `1 + height` while grasped, else `exp(-0.25 * distance)`. The reward `completion` keeps that
+    shape, but bounds what a step without success can pay, so that finishing is worth more than
+    holding the cube just below the goal: at discount 0.99 the paper's reward pays 130 for holding
+    it there for ever, and 100 for success.
+
+    Attributes:
+      lift: height that the cube must be lifted to, above its rest, m.
+      start: `home`, or `in_grasp` with the cube in the closed gripper.
+      success_reward: paid once, on success.
+      distance_decay: per `distance_unit`, reward `paper`; its 0.25.
+      distance_unit: m; the paper names none, ours is a decimetre.
+      height_unit: m; the unit of the cube's height in the paper's `1 + height`.
+      completion_decay: per `distance_unit`, reward `completion`.
+      completion_reach: most that a step without a grasp pays, reward `completion`.
+      completion_grasp: paid for a grasp at height 0, reward `completion`.
+      completion_lift: most that is paid on top for the height, with its square root: in proportion
+        to the height, the first degree of a lift is worth 2 % of a Q-value, and is not found.
+    """
+
+    lift: Positive = 0.3
+    start: Literal["home", "in_grasp"] = "home"
+    success_reward: float = 100.0
+    distance_decay: Positive = 0.25
+    distance_unit: Positive = 0.1
+    height_unit: Positive = 1.0
+    completion_decay: Positive = 1.0
+    completion_reach: float = 0.2
+    completion_grasp: float = 0.25
+    completion_lift: float = 0.5
+
+
+class Lift:
+    """Grasp the cube and lift it.
+
+    The scene needs a cube: a box `cube` of equal edges on a free joint `cube`, which lies on the
+    ground in the keyframe `home`; spheres `left_pad_0`, ... and `right_pad_0`, ... on the fingers;
+    and a numeric `cube_rectangle`: centre x, y and half extents x, y of the cube's places, m.
+
+    It measures `grasped` and `success` (bool), `height` of the cube above its rest and `distance`
+    between the grasp site and the cube's centre (m).
+
+    Raises:
+      ValueError: the scene lacks one of these, or it is of another kind.
+    """
+
+    def __init__(self, config: LiftConfig, scene: Scene, arm: Arm):
+        model = scene.mj_model
+        self.config, self.arm = config, arm
+        self._model = model
+        self.cube_geom = scene.find("geom", _CUBE)
+        self.cube_qpos = int(model.jnt_qposadr[scene.find("joint", _CUBE)])
+        self.pad_geoms = _find_pads(scene)
+        self.half_size = _check_cube(scene, self.cube_geom, arm)
+        self._centre, self._extent = rectangle(scene, "cube_rectangle")
+        self._home = arm.home_qpos[self.cube_qpos : self.cube_qpos + 2]
+        self._kinematics = make_kinematics(model)
+        self.varies: Varies = {}
+        self.rewards: Mapping[str, Reward] = {
+            "paper": functools.partial(paper_reward, config),
+            "completion": functools.partial(completion_reward, config),
+        }
+        self.feature_scales = (*[5.0] * 3, *[1.0] * 4, *[10.0] * 3)
+
+    @property
+    def obstacles(self) -> tuple[Obstacle, ...]:
+        """The cube by its bounding sphere; none where it starts in the gripper."""
+        if self.config.start == "in_grasp":
+            return ()
+        return (Obstacle(self.cube_geom, self.half_size * float(np.sqrt(3))),)
+
+    def fixed_placement(self) -> jax.Array:
+        """The cube's place in the keyframe `home`, `[2] float32`, m."""
+        return jnp.asarray(self._home)
+
+    def sample_placement(self, key: jax.Array) -> jax.Array:
+        """A place for the cube, uniform in its rectangle, `[2] float32`, m. Consumes the key."""
+        low, high = self._centre - self._extent, self._centre + self._extent
+        return jax.random.uniform(key, (2,), jnp.float32, jnp.asarray(low), jnp.asarray(high))
+
+    def start(
+        self, qpos: jax.Array, ctrl: jax.Array, placement: jax.Array
+    ) -> tuple[jax.Array, jax.Array, Params]:
+        """Puts the cube on its place, or into the gripper, which is closed then."""
+        arm, cube = self.arm, slice(self.cube_qpos, self.cube_qpos + 7)
+        if self.config.start == "home":
+            return qpos.at[self.cube_qpos : self.cube_qpos + 2].set(placement), ctrl, {}
+        qpos = qpos.at[arm.finger_qpos].set(np.float32(self.half_size - _SQUEEZE))
+        ctrl = ctrl.at[arm.gripper_ctrl].set(arm.ctrl_range[arm.gripper_ctrl, 0])
+        poses = self._kinematics(qpos)
+        # The pads are spheres without a rotation of their own, so theirs is the gripper's.
+        gripper = Rotation.from_matrix(poses.geom_xmat[self.pad_geoms[0, 0]])
+        pose = [poses.site_xpos[arm.grasp_site], gripper.as_quat(scalar_first=True)]
+        return qpos.at[cube].set(jnp.concatenate(pose)), ctrl, {}
+
+    def accepts(self, poses: Poses, placement: jax.Array) -> jax.Array:
+        """Every start with a free arm fits."""
+        del poses, placement
+        return jnp.ones((), jnp.bool_)
+
+    def measure(self, state: EnvState) -> dict[str, jax.Array]:
+        """`grasped`, `height`, `distance` and `success` of a state; see the class."""
+        poses = state.physics.poses
+        cube = poses.geom_xpos[self.cube_geom]
+        offset = poses.site_xpos[self.arm.grasp_site] - cube
+        height = cube[2] - np.float32(self.half_size)
+        held = grasped(self, poses, state.ctrl) & ~state.physics.diverged
+        return {
+            "grasped": held,
+            "height": height,
+            "distance": jnp.sqrt(jnp.sum(jnp.square(offset))),
+            "success": held & (height >= self.config.lift),
+        }
+
+    def features(self, state: EnvState) -> jax.Array:
+        """The cube's position (m) and quaternion, and the way to it from the grasp site (m)."""
+        cube = state.physics.qpos[self.cube_qpos : self.cube_qpos + 7]
+        site = state.physics.poses.site_xpos[self.arm.grasp_site]
+        return jnp.concatenate([cube, cube[:3] - site])
+
+
+def grasped(task: Lift, poses: Poses, ctrl: jax.Array) -> jax.Array:
+    """Whether the gripper, commanded to close, holds the cube between its fingers.
+
+    True where a pad of each finger touches the cube and the two touched faces are opposite ones.
+    A pure function of the state; the tests compare it with the contact forces.
+
+    Args:
+      task: with the ids of pads and cube.
+      poses: of the geoms.
+      ctrl: `[nu] float32`.
+
+    Returns:
+      `[] bool`.
+    """
+    radius = task._model.geom_size[task.pad_geoms, 0].astype(np.float32)
+    half = np.float32(task.half_size)
+    offset = poses.geom_xpos[task.pad_geoms] - poses.geom_xpos[task.cube_geom]
+    rotation = poses.geom_xmat[task.cube_geom]
+    local = jnp.sum(offset[..., :, None] * rotation, axis=-2)
+    beyond = jnp.abs(local) - half
+    outside = jnp.sqrt(jnp.sum(jnp.square(jnp.maximum(beyond, 0.0)), axis=-1))
+    distance = outside + jnp.minimum(jnp.max(beyond, axis=-1), 0.0) - radius
+    touching = distance < _TOUCH
+    # [finger, pad, face]: which of the six faces a touching pad is on.
+    axis = jax.nn.one_hot(jnp.argmax(beyond, axis=-1), 3, dtype=jnp.bool_) & touching[..., None]
+    positive = jnp.any(axis & (local > 0), axis=1)
+    negative = jnp.any(axis & (local < 0), axis=1)
+    opposed = (positive[0] & negative[1]) | (negative[0] & positive[1])
+    closing = ctrl[task.arm.gripper_ctrl] < half
+    return closing & jnp.any(opposed)
+
+
+def paper_reward(
+    config: LiftConfig, before: Snapshot, after: Snapshot, action: jax.Array
+) -> dict[str, jax.Array]:
+    """Algorithm 1 of James & Johns 2016; see `LiftConfig`."""
+    del before, action
+    height = after.measured["height"]
+    distance = after.measured["distance"] / config.distance_unit
+    return _terms(
+        config,
+        after,
+        reach=jnp.exp(-config.distance_decay * distance),
+        grasp=jnp.ones_like(height),
+        lift=height / config.height_unit,
+    )
+
+
+def completion_reward(
+    config: LiftConfig, before: Snapshot, after: Snapshot, action: jax.Array
+) -> dict[str, jax.Array]:
+    """The paper's reward, bounded so that success is worth more than waiting; see `LiftConfig`."""
+    del before, action
+    height = after.measured["height"]
+    distance = after.measured["distance"] / config.distance_unit
+    share = jnp.clip(height / config.lift, 0.0, 1.0)
+    return _terms(
+        config,
+        after,
+        reach=config.completion_reach * jnp.exp(-config.completion_decay * distance),
+        grasp=jnp.full_like(height, config.completion_grasp),
+        lift=config.completion_lift * jnp.sqrt(share),
+    )
+
+
+def _terms(
+    config: LiftConfig, after: Snapshot, *, reach: jax.Array, grasp: jax.Array, lift: jax.Array
+) -> dict[str, jax.Array]:
+    """`reach` without a grasp, `grasp` and `lift` with one, and on success `success` alone."""
+    held, success = after.measured["grasped"], after.measured["success"]
+    zero = jnp.zeros_like(reach)
+    holding = held & ~success
+    return {
+        "reach": jnp.where(held | success, zero, reach),
+        "grasp": jnp.where(holding, grasp, zero),
+        "lift": jnp.where(holding, lift, zero),
+        "success": jnp.where(success, jnp.full_like(zero, config.success_reward), zero),
+    }
+
+
+def _find_pads(scene: Scene) -> np.ndarray:
+    """Geom ids of the pads of the left and of the right finger, `[2, P] int`."""
+    model = scene.mj_model
+    names = [model.geom(i).name for i in range(model.ngeom)]
+    counts = [sum(name.startswith(f"{side}_pad_") for name in names) for side in ("left", "right")]
+    if counts[0] == 0 or counts[0] != counts[1]:
+        raise ValueError(
+            f"scene {scene.name!r} has {counts[0]} geoms 'left_pad_...' and {counts[1]} geoms "
+            "'right_pad_...'; the task needs an equal number of both, at least one"
+        )
+    pads = np.asarray(
+        [
+            [scene.find("geom", f"{side}_pad_{i}") for i in range(counts[0])]
+            for side in ("left", "right")
+        ]
+    )
+    for pad in pads.ravel().tolist():
+        if model.geom_type[pad] != mujoco.mjtGeom.mjGEOM_SPHERE:
+            raise ValueError(f"scene {scene.name!r}: geom {names[pad]!r} must be a sphere")
+    return pads
+
+
+def _check_cube(scene: Scene, geom: int, arm: Arm) -> float:
+    """Half the edge of the cube, m; refuses everything else than a cube on the ground."""
+    model, name = scene.mj_model, scene.name
+    joint = scene.find("joint", _CUBE)
+    size = model.geom_size[geom]
+    if model.geom_type[geom] != mujoco.mjtGeom.mjGEOM_BOX or np.ptp(size) > 1e-6:
+        raise ValueError(f"scene {name!r}: geom 'cube' must be a box of three equal edges")
+    if model.jnt_type[joint] != mujoco.mjtJoint.mjJNT_FREE:
+        raise ValueError(f"scene {name!r}: joint 'cube' must be a free joint")
+    if model.jnt_bodyid[joint] != model.geom_bodyid[geom]:
+        raise ValueError(f"scene {name!r}: joint 'cube' must move the body of geom 'cube'")
+    if model.geom_pos[geom].any() or abs(model.geom_quat[geom][0]) < 1 - 1e-9:
+        raise ValueError(f"scene {name!r}: geom 'cube' must be at the origin of its body")
+    half = float(size[0])
+    rest = arm.home_qpos[model.jnt_qposadr[joint] + 2]
+    if abs(rest - half) > 1e-3:
+        raise ValueError(
+            f"scene {name!r}: in the keyframe 'home' the cube must lie on the ground at height 0, "
+            f"its centre {half} m above it, got {rest}"
+        )
+    low, high = arm.ctrl_range[arm.gripper_ctrl]
+    if not low < half < high:
+        raise ValueError(
+            f"scene {name!r}: the range of the actuator 'gripper', {low} to {high} m, must "
+            f"contain half the cube's edge, {half} m"
+        )
+    return half

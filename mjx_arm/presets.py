@@ -1,0 +1,61 @@
+"""Starting points of the command line."""
+
+from __future__ import annotations
+
+from mjx_arm.config import TrainConfig, train_config
+
+# `fast` is the default on a CPU; `pixels` has no teacher that sees the simulator's state; `smoke`
+# shows in minutes that everything works; `paper` has every value that James & Johns 2016 state,
+# and where they state none (batch, target period, number of environments) ours; `gpu` is for
+# thousands of environments on an accelerator.
+PRESETS: dict[str, TrainConfig] = {
+    "fast": train_config(
+        algorithm="distill",
+        max_steps=500,
+        replay_size=1_000_000,
+        total_steps=2_500_000,
+        select_every=131_072,
+        select_episodes=200,
+    ),
+    "pixels": train_config(n_step=5),
+    "smoke": train_config(
+        total_steps=32_768,
+        replay_size=20_000,
+        learning_starts=1_000,
+        epsilon_steps=20_000,
+        batch_size=32,
+        chunk_steps=4_096,
+        select_every=16_384,
+        select_episodes=16,
+    ),
+    "paper": train_config(
+        reward="paper",
+        reward_scale=1.0,
+        max_steps=1_000,
+        total_steps=10_000_000,
+        num_envs=32,  # so that the replay holds exactly 500,000
+        replay_size=500_000,
+        n_step=1,
+        learning_rate=6e-6,
+        max_grad_norm=0.0,
+        double=False,
+        dueling=False,
+        huber=False,
+        polyak=0.0,
+        epsilon_steps=1_000_000,
+        epsilon_spread=1.0,
+    ),
+    "gpu": train_config(
+        algorithm="distill",
+        num_envs=4_096,
+        max_steps=500,
+        replay_size=4_194_304,
+        chunk_steps=262_144,
+        total_steps=40_000_000,
+        select_every=2_097_152,
+        select_episodes=200,
+        teacher_batch_size=8_192,
+        student_batch_size=2_048,
+        student_updates_per_step=4,
+    ),
+}

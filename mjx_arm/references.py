@@ -1,0 +1,90 @@
+"""Objects of a user's own, by import path: `module:name`, and a digest of their source."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib
+import inspect
+import pathlib
+import sys
+from typing import Any
+
+_LOCAL = ("<lambda>", "<locals>", "__main__")
+
+
+def is_reference(text: str) -> bool:
+    """Whether a text has the form `module:name`."""
+    return ":" in text
+
+
+def reference_to(value: Any) -> str:
+    """`module:name` of a function or class; of another object, that of its class."""
+    named = value if hasattr(value, "__qualname__") else type(value)
+    return f"{named.__module__}:{named.__qualname__}"
+
+
+def is_importable(reference: str) -> bool:
+    """Whether another process can import what a reference names; a lambda it cannot."""
+    return not any(part in reference for part in _LOCAL)
+
+
+def load_module(name: str, what: str) -> Any:
+    """Imports a module, which may also be in the working directory.
+
+    Args:
+      name: its import path.
+      what: what it is for, for the error.
+
+    Raises:
+      ValueError: it cannot be imported.
+    """
+    here = str(pathlib.Path.cwd())
+    added = here not in sys.path
+    if added:
+        sys.path.insert(0, here)
+    try:
+        return importlib.import_module(name)
+    except Exception as error:  # whatever a user's module raises while it is imported
+        reason = " ".join(str(error).split())
+        raise ValueError(
+            f"{what}: module {name!r} cannot be imported ({type(error).__name__}: {reason}); "
+            "give a module in the working directory or on the Python path"
+        ) from error
+    finally:
+        if added:
+            sys.path.remove(here)
+
+
+def load_reference(reference: str, what: str) -> Any:
+    """Imports the object that `module:name` names.
+
+    Args:
+      reference: the import path.
+      what: what the object is, for the error.
+
+    Raises:
+      ValueError: the module cannot be imported, or lacks the name.
+    """
+    module_name, _, name = reference.partition(":")
+    value: Any = load_module(module_name, what)
+    for part in name.split("."):
+        if not hasattr(value, part):
+            raise ValueError(f"{what}: module {module_name!r} has no {name!r}")
+        value = getattr(value, part)
+    return value
+
+
+def source_digest(value: Any) -> str:
+    """SHA-256 of the source of a function or class, or of the class of another object.
+
+    Raises:
+      ValueError: the source is not in a file.
+    """
+    named = value if hasattr(value, "__qualname__") else type(value)
+    try:
+        source = inspect.getsource(named)
+    except (OSError, TypeError) as error:
+        raise ValueError(
+            f"the source of {reference_to(value)!r} is not in a file: define it in a module"
+        ) from error
+    return hashlib.sha256(inspect.cleandoc(source).encode()).hexdigest()

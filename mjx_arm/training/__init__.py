@@ -1,0 +1,1 @@
+"""Training runs: the compiled loop, and what surrounds it: folders, checkpoints, evaluations."""

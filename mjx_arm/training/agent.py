@@ -1,0 +1,274 @@
+"""A trained agent in one file: configuration, scene, parameters, how it did, and a digest."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import pathlib
+from collections.abc import Mapping
+from typing import Any
+
+import flax.traverse_util
+import jax
+import jax.numpy as jnp
+import numpy as np
+import safetensors
+import safetensors.numpy
+
+from mjx_arm.algos.base import Algorithm
+from mjx_arm.algos.exploration import epsilon_greedy
+from mjx_arm.config import TrainConfig, dump_config, parse_config, set_train_options
+from mjx_arm.envs.config import EnvConfig
+from mjx_arm.envs.env import Env, make_env
+from mjx_arm.options import flat_names, get_option, set_options
+from mjx_arm.training.algorithm import make_algorithm
+from mjx_arm.training.objects import Objects, Record, check_record
+
+_FORMAT = "mjx_arm agent 2"
+LAST, BEST = "last.safetensors", "best.safetensors"
+# What an agent sees; all other options of the environment are fixed by its name.
+_SIGHT = ("scene", "task", "observation", "size", "camera", "shadows")
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Agent:
+    """A policy with its environment.
+
+    Attributes:
+      config: of the run that trained it, with the options that were changed for loading.
+      trained_env: options of the environment that it was trained in.
+      env: the environment to try it in.
+      algorithm: the algorithm, with the network.
+      params: of the network.
+      env_steps: environment steps that it was trained for.
+      selection_rate: share of successes in the evaluation that selected it, or None.
+    """
+
+    config: TrainConfig
+    trained_env: EnvConfig
+    env: Env
+    algorithm: Algorithm
+    params: Any
+    env_steps: int
+    selection_rate: float | None
+
+    def apply(self, params: Any, obs: jax.Array) -> jax.Array:
+        """Q-values of observations `[N, ...]`, `[N, A] float32`."""
+        return self.algorithm.apply(params, obs)
+
+    def q_values(self, obs: jax.Array) -> jax.Array:
+        """Q-values of one observation of `env`, `[A] float32`."""
+        return self.algorithm.apply(self.params, obs[None])[0]
+
+    def act(self, obs: jax.Array, key: jax.Array, epsilon: float = 0.0) -> jax.Array:
+        """Chooses an action.
+
+        Args:
+          obs: one observation of `env`: `[H, W] uint32` packed pixels.
+          key: consumed.
+          epsilon: share of random actions.
+
+        Returns:
+          `[] int32`.
+        """
+        return epsilon_greedy(key, self.q_values(obs)[None], jnp.float32(epsilon))[0]
+
+
+def save_agent(
+    path: pathlib.Path,
+    config: TrainConfig,
+    params: Any,
+    *,
+    scene: str,
+    objects: Record,
+    env_steps: int,
+    selection_rate: float | None = None,
+) -> None:
+    """Writes an agent to one file: whole, or not at all.
+
+    The backend of the physics is left to the user who tries the agent.
+
+    Args:
+      path: of the file, which ends in `.safetensors`.
+      config: of the run.
+      params: of the network.
+      scene: text of the scene.
+      objects: record of the user's own objects.
+      env_steps: environment steps of the training.
+      selection_rate: share of successes in the evaluation that selected it.
+
+    Raises:
+      ValueError: the disk is full, or the folder cannot be written.
+    """
+    config = dataclasses.replace(config, env=dataclasses.replace(config.env, physics="auto"))
+    tensors = {name: np.asarray(x) for name, x in flatten_params(jax.device_get(params)).items()}
+    metadata = {
+        "format": _FORMAT,
+        "config": json.dumps(dump_config(config)),
+        "scene": scene,
+        "objects": json.dumps(objects),
+        "env_steps": json.dumps(env_steps),
+        "selection_rate": json.dumps(selection_rate),
+    }
+    metadata["sha256"] = _digest(metadata, tensors)
+    part = path.with_name(f"{path.name}.part")
+    try:
+        part.write_bytes(safetensors.numpy.save(tensors, metadata))
+        part.replace(path)
+    except OSError as error:
+        part.unlink(missing_ok=True)
+        raise ValueError(f"{path} could not be written: {error.strerror}") from error
+
+
+def flatten_params(params: Any) -> dict[str, Any]:
+    """Parameters by names such as `params/Dense_0/kernel`."""
+    flat: dict[str, Any] = flax.traverse_util.flatten_dict(params, sep="/")
+    return flat
+
+
+def _digest(metadata: Mapping[str, str], tensors: Mapping[str, np.ndarray]) -> str:
+    sha = hashlib.sha256()
+    for name in sorted(metadata):
+        sha.update(json.dumps([name, metadata[name]]).encode())
+    for name in sorted(tensors):
+        x = tensors[name]
+        sha.update(json.dumps([name, str(x.dtype), list(x.shape)]).encode())
+        sha.update(np.ascontiguousarray(x).tobytes())
+    return sha.hexdigest()
+
+
+def read_agent(path: pathlib.Path) -> tuple[dict[str, str], dict[str, np.ndarray]]:
+    """Metadata and tensors of an agent's file.
+
+    Raises:
+      ValueError: it is not the file of an agent of this version, or it is damaged.
+    """
+    try:
+        with safetensors.safe_open(path, framework="np") as file:
+            metadata = dict(file.metadata() or {})
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    except (safetensors.SafetensorError, OSError, TypeError, UnicodeDecodeError) as error:
+        raise ValueError(f"{path} is not the file of an agent, or it is damaged") from error
+    if metadata.get("format") != _FORMAT:
+        raise ValueError(f"{path} is not the file of an agent of this version")
+    if metadata.pop("sha256", None) != _digest(metadata, tensors):
+        raise ValueError(f"{path} is damaged: it does not match its own digest")
+    return metadata, tensors
+
+
+def load_agent(
+    path: str | pathlib.Path,
+    *,
+    max_steps: int = 1_000,
+    network: Any = None,
+    reward: Any = None,
+    env: str | None = None,
+    **options: Any,
+) -> Agent:
+    """Reads a trained agent, with the environment to try it in.
+
+    What the agent sees is as in its training; all else is as the environment's name fixes it:
+    1,000 iterations, and in B new places for all objects after every episode, failed ones included.
+
+    Args:
+      path: an agent's file, or a run folder, of which the best agent is taken, or the last one
+        where none was selected.
+      max_steps: iterations until an episode is truncated.
+      network: the Flax module, if the agent was trained with one that was passed as an object.
+      reward: the same for a reward.
+      env: `"A"` or `"B"`; by default the one that it was trained in.
+      **options: other options to change, such as `physics`.
+
+    Raises:
+      ValueError: there is no agent, or it is damaged, or an option does not fit.
+    """
+    path = find_agent(pathlib.Path(path))
+    metadata, tensors = read_agent(path)
+    trained = parse_config(metadata["config"], str(path))
+    objects = Objects(network=network, reward=reward)
+    check_record(json.loads(metadata["objects"]), trained, objects, str(path))
+    judged = evaluation_config(trained.env, env=env, max_steps=max_steps)
+    config = dataclasses.replace(trained, env=judged)
+    config = set_train_options(config, options)
+    made = make_env(config.env, reward=reward)
+    algorithm = make_algorithm(config, made, network)
+    params = _restore(path, algorithm, made, tensors)
+    return Agent(
+        config,
+        trained.env,
+        made,
+        algorithm,
+        params,
+        json.loads(metadata["env_steps"]),
+        json.loads(metadata["selection_rate"]),
+    )
+
+
+def _restore(
+    path: pathlib.Path, algorithm: Algorithm, env: Env, tensors: Mapping[str, np.ndarray]
+) -> Any:
+    def init() -> Any:
+        obs, _ = env.reset(jax.random.key(0))
+        return algorithm.init_policy(jax.random.key(0), jax.tree.map(lambda x: x[None], obs))
+
+    expected = flatten_params(jax.eval_shape(init))
+    shapes = {name: (x.shape, x.dtype) for name, x in expected.items()}
+    if {name: (x.shape, x.dtype) for name, x in tensors.items()} != shapes:
+        raise ValueError(f"{path} holds the parameters of another network")
+    for name, x in tensors.items():
+        if not np.isfinite(x).all():
+            raise ValueError(f"{path} holds numbers in {name!r} that are not finite")
+    arrays = {name: jnp.asarray(tensors[name]) for name in expected}
+    return flax.traverse_util.unflatten_dict(arrays, sep="/")
+
+
+def evaluation_config(
+    trained: EnvConfig, *, env: str | None = None, max_steps: int = 1_000
+) -> EnvConfig:
+    """Options of the environment that judges an agent; see `load_agent`."""
+    sight = {name: getattr(trained, name) for name in _SIGHT}
+    start = EnvConfig(
+        task_options=type(trained.task_options)(),
+        reward=trained.reward,
+        reward_scale=trained.reward_scale,
+        physics=trained.physics,
+        max_steps=max_steps,
+        **sight,
+    )
+    start = set_options(start, {"env": env or trained.env})
+    placement = "fixed" if start.placed == "fixed" else "always"
+    return set_options(start, {"placement": placement})
+
+
+def differences(trained: EnvConfig, judged: EnvConfig) -> dict[str, tuple[Any, Any]]:
+    """Options in which an agent's training differs from what it is judged in."""
+    names = [name for name in flat_names(judged) if name not in ("physics", "placement")]
+    pairs = {name: (get_option(trained, name), get_option(judged, name)) for name in names}
+    return {name: pair for name, pair in pairs.items() if pair[0] != pair[1]}
+
+
+def find_agent(path: pathlib.Path) -> pathlib.Path:
+    """The agent's file that a path means.
+
+    Raises:
+      ValueError: there is none.
+    """
+    if path.is_file():
+        return path
+    for name in (BEST, LAST):
+        if (path / name).is_file():
+            return path / name
+    if (path / "config.json").is_file():
+        seeds = ", ".join(sorted(str(seed) for seed in path.glob("seed-*")))
+        hint = f"give one of {seeds}" if seeds else "the run has not saved one yet"
+        raise ValueError(f"{path} holds no agent: {hint}")
+    raise ValueError(f"{path} is not a run folder and not an agent: give one that `train` has made")
+
+
+def read_selection_rate(path: pathlib.Path) -> float | None:
+    """The share of successes with which an agent's file was selected, or None."""
+    if not path.is_file():
+        return None
+    rate: float | None = json.loads(read_agent(path)[0]["selection_rate"])
+    return rate

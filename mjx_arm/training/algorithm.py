@@ -1,0 +1,61 @@
+"""The algorithm of a configuration."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from mjx_arm.algos.base import Algorithm
+from mjx_arm.algos.distill import Distill
+from mjx_arm.algos.dqn import DQN, QLearning, make_adam, make_q_learning
+from mjx_arm.algos.frames import make_frames
+from mjx_arm.config import DistillConfig, DQNConfig, TrainConfig
+from mjx_arm.envs.env import Env
+from mjx_arm.networks import FeatureQNetwork, make_network
+
+
+def make_algorithm(config: TrainConfig, env: Env, network: Any = None) -> Algorithm:
+    """Makes the algorithm of a configuration.
+
+    Args:
+      config: the options.
+      env: the environment that it trains in.
+      network: a Flax module `observations [B, ...] -> Q-values [B, A]`; by default the one that
+        the configuration names.
+
+    Raises:
+      ValueError: the network cannot be made.
+    """
+    from_state = config.env.observation == "state"
+    if network is None:
+        network = make_network(
+            config.network,
+            num_actions=env.num_actions,
+            feature_scales=env.feature_scales if from_state else None,
+        )
+    storage, algo = config.replay.storage, config.algo
+    if isinstance(algo, DistillConfig):
+        frames = make_frames(env, storage, with_features=True)
+        return Distill(algo, frames, make_teacher(algo, env), network, config.num_envs)
+    assert isinstance(algo, DQNConfig)
+    learning = make_q_learning(algo, network, pixels=not from_state)
+    return DQN(algo, make_frames(env, storage), learning, config.num_envs)
+
+
+def make_teacher(config: DistillConfig, env: Env) -> QLearning:
+    """Q-learning of a network that sees the state features."""
+    network: Any = FeatureQNetwork(
+        env.num_actions,
+        config.teacher_hidden,
+        dueling=True,
+        scales=env.feature_scales,
+        layer_norm=True,
+    )
+    return QLearning(
+        apply=network.apply,
+        init_params=network.init,
+        optimizer=make_adam(config.teacher_learning_rate, 10.0),
+        double=True,
+        huber=True,
+        polyak=config.teacher_polyak,
+        target_period=1,
+    )

@@ -1,0 +1,304 @@
+"""The training loop: collect, store, learn and count in one body, a chunk of it in one scan."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+
+from mjx_arm.algos.base import Algorithm
+from mjx_arm.algos.collect import Counts, Episodes, act, count_episodes, init_episodes, means
+from mjx_arm.algos.exploration import epsilon_at, spread_epsilon
+from mjx_arm.algos.replay import Replay, Step, add, init_replay
+from mjx_arm.config import TrainConfig
+from mjx_arm.envs.auto_reset import AutoReset, AutoResetState
+from mjx_arm.envs.env import Env, make_env
+from mjx_arm.envs.tasks.base import Reward
+from mjx_arm.microbatch import microbatched, overwrite_microbatched
+from mjx_arm.physics import compiler_options
+from mjx_arm.training.algorithm import make_algorithm
+
+# Each use of a run's seed has its own keys, so that training never sees what judges it.
+TRAINING, SELECTION, EVALUATION = range(3)
+
+
+@flax.struct.dataclass
+class LoopState:
+    """Everything that training changes; the carry of the scan.
+
+    Attributes:
+      learner: networks and optimizers.
+      envs: `[N]` environments.
+      obs: `[N, ...]`, what the agent sees of them. Carried, so that it is rendered once: on CPU
+        XLA casts the rays again for every consumer that it can fuse with.
+      replay: the ring.
+      key: PRNG key.
+      vector_step: `[] int32`, steps of all environments so far.
+      episodes: running sums of the episodes under way.
+      counts: sums over the steps of this chunk, `[] float32`.
+    """
+
+    learner: Any
+    envs: AutoResetState
+    obs: Any
+    replay: Replay
+    key: jax.Array
+    vector_step: jax.Array
+    episodes: Episodes
+    counts: Counts
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Trainer:
+    """A training run's pure functions.
+
+    Attributes:
+      config: the options.
+      env: the environment that it trains in.
+      algorithm: the algorithm.
+      init: `key -> LoopState`.
+      run_chunk: `LoopState -> (LoopState, Counts)`, compiled; donates its argument. The counts are
+        those of the chunk.
+
+    With `num_seeds` above 1 keys, states and counts have a leading axis of seeds.
+    """
+
+    config: TrainConfig
+    env: Env
+    algorithm: Algorithm
+    init: jax.stages.Wrapped
+    run_chunk: jax.stages.Wrapped
+
+
+def make_trainer(
+    config: TrainConfig,
+    *,
+    env: Env | None = None,
+    network: Any = None,
+    reward: Reward | None = None,
+    algorithm: Callable[[TrainConfig, Env], Algorithm] | None = None,
+) -> Trainer:
+    """Makes the functions of a training run.
+
+    Args:
+      config: the options.
+      env: an environment of one's own; by default that of the configuration.
+      network: a Flax module `observations [B, ...] -> Q-values [B, A]`; by default the one that
+        the configuration names.
+      reward: a function as in `mjx_arm.make`; by default the one that the configuration names.
+      algorithm: makes an algorithm of one's own; by default that of the configuration.
+
+    Raises:
+      ValueError: the environment or the network cannot be made.
+    """
+    body = make_body(config, env=env, network=network, reward=reward, algorithm=algorithm)
+    init, run_chunk = body.init, body.run_chunk
+    if config.num_seeds > 1:
+        init, run_chunk = jax.vmap(init), jax.vmap(run_chunk)
+    own = body.env.env
+    return Trainer(
+        config=config,
+        env=own,
+        algorithm=body.algorithm,
+        init=jax.jit(init),
+        run_chunk=jax.jit(
+            run_chunk, donate_argnums=0, compiler_options=compiler_options(own.physics)
+        ),
+    )
+
+
+def make_train(
+    config: TrainConfig, **parts: Any
+) -> Callable[[jax.Array], tuple[LoopState, Counts]]:
+    """Makes a whole training run as one function, for use from Python.
+
+    It writes no files and never looks at the clock; `mjx_arm.train` does.
+
+    Args:
+      config: the options; `seed` and `num_seeds` have no meaning here.
+      **parts: `env`, `network`, `reward` or `algorithm`, as in `make_trainer`.
+
+    Returns:
+      `train(key) -> (state, counts)`: the state after the last step, and the counts of each chunk,
+      `[chunks]` each. Pure; may be jitted, and vmapped over keys.
+
+    Raises:
+      ValueError: the environment cannot be made.
+    """
+    body = make_body(config, **parts)
+
+    def train(key: jax.Array) -> tuple[LoopState, Counts]:
+        return jax.lax.scan(
+            lambda state, _: body.run_chunk(state), body.init(key), None, length=config.num_chunks
+        )
+
+    return train
+
+
+def run_keys(config: TrainConfig) -> jax.Array:
+    """The key that a run starts from, or with several seeds those of all, `[S]`."""
+    if config.num_seeds == 1:
+        return role_key(config.seed, TRAINING)
+    seeds = config.seed + jnp.arange(config.num_seeds)
+    return jax.vmap(lambda seed: role_key(seed, TRAINING))(seeds)
+
+
+def role_key(seed: int | jax.Array, role: int) -> jax.Array:
+    """The key of one use of a seed: `TRAINING`, `SELECTION` or `EVALUATION`."""
+    return jax.random.fold_in(jax.random.key(seed), role)
+
+
+def make_body(
+    config: TrainConfig,
+    *,
+    env: Env | None = None,
+    network: Any = None,
+    reward: Reward | None = None,
+    algorithm: Callable[[TrainConfig, Env], Algorithm] | None = None,
+) -> Body:
+    """Makes the body of the scan, for one seed; see `make_trainer`."""
+    own = make_env(config.env, reward=reward) if env is None else env
+    made = make_algorithm(config, own, network) if algorithm is None else algorithm(config, own)
+    return Body(config, AutoReset(own), made)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Body:
+    """The body of the scan, for one seed.
+
+    Attributes:
+      config: the options.
+      env: the environment, which resets itself.
+      algorithm: the algorithm.
+    """
+
+    config: TrainConfig
+    env: AutoReset
+    algorithm: Algorithm
+
+    def init(self, key: jax.Array) -> LoopState:
+        """The state before the first step. Consumes the key."""
+        config, frames = self.config, self.algorithm.frames
+        reset_key, learner_key, key = jax.random.split(key, 3)
+        keys = jax.random.split(reset_key, config.num_envs)
+        # The images that `reset` renders all at once are dropped: 4,096 need 220 MB to work in.
+        envs = jax.vmap(self.env.reset)(keys)[1]
+        obs = microbatched(frames.observe)(envs)
+        frame = frames.encode(envs, obs)
+        nothing = jnp.zeros((config.num_envs,), jnp.bool_)
+        step = Step(
+            frame=frame,
+            action=nothing.astype(jnp.uint8),
+            reward=nothing.astype(jnp.float32),
+            terminated=nothing,
+            truncated=nothing,
+            masked=nothing,
+        )
+        first_obs, first_frame = jax.tree.map(lambda x: x[:1], (obs, frame))
+        state = LoopState(
+            learner=self.algorithm.init(learner_key, first_obs, first_frame),
+            envs=envs,
+            obs=obs,
+            replay=init_replay(step, config.replay_slots),
+            key=key,
+            vector_step=jnp.zeros((), jnp.int32),
+            episodes=init_episodes(self.env, envs),
+            counts={},
+        )
+        # One abstract step says which counts there are.
+        counts = jax.eval_shape(lambda s: self.step(s, None)[0].counts, state)
+        zeros = {name: jnp.zeros(x.shape, x.dtype) for name, x in counts.items()}
+        return dataclasses.replace(state, counts=zeros)
+
+    def run_chunk(self, state: LoopState) -> tuple[LoopState, Counts]:
+        """Runs `TrainConfig.chunk_length` steps; the counts are theirs."""
+        state = dataclasses.replace(state, counts=jax.tree.map(jnp.zeros_like, state.counts))
+        state, _ = jax.lax.scan(self.step, state, None, length=self.config.chunk_length)
+        return state, state.counts
+
+    def step(self, state: LoopState, _: None) -> tuple[LoopState, None]:
+        """Collects, stores, learns and counts one step of all environments."""
+        config, algorithm = self.config, self.algorithm
+        key, act_key, learn_key = jax.random.split(state.key, 3)
+        env_steps = state.vector_step * config.num_envs
+        epsilon = epsilon_at(config.exploration, env_steps)
+        epsilon = spread_epsilon(config.exploration, epsilon, config.num_envs)
+        frame = algorithm.frames.encode(state.envs, state.obs)
+        q = algorithm.q_values(state.learner, state.obs, frame, env_steps)
+        action, envs, transition = act(self.env, act_key, state.envs, q, epsilon)
+        replay = add(
+            state.replay,
+            Step(
+                frame=frame,
+                action=action.astype(jnp.uint8),
+                reward=transition.reward,
+                terminated=transition.terminated,
+                truncated=transition.truncated,
+                masked=transition.info["reset"] | transition.info["diverged"],
+            ),
+        )
+        learner, learned = algorithm.learn(learn_key, state.learner, replay, env_steps)
+        episodes, counts = count_episodes(state.episodes, transition, q)
+        counts |= learned
+        state = LoopState(
+            learner=learner,
+            envs=envs,
+            obs=self._observe(envs, state.obs, env_steps + config.num_envs),
+            replay=replay,
+            key=key,
+            vector_step=state.vector_step + 1,
+            episodes=episodes,
+            counts={name: state.counts.get(name, 0.0) + count for name, count in counts.items()},
+        )
+        return state, None
+
+    def _observe(self, envs: AutoResetState, old: Any, env_steps: jax.Array) -> Any:
+        """What the environments show, written over `old`; or `old`, where nothing looks at it."""
+        algorithm = self.algorithm
+        wanted: jax.Array | bool = True
+        if self.config.replay.storage == "states":
+            wanted = algorithm.acts_on_obs(env_steps)
+
+        def observe(old: Any) -> Any:
+            return overwrite_microbatched(algorithm.frames.observe, envs, old)
+
+        if isinstance(wanted, bool):
+            return observe(old) if wanted else old
+        return jax.lax.cond(wanted, observe, lambda old: old, old)
+
+
+def summarise(
+    config: TrainConfig, algorithm: Algorithm, counts: dict[str, Any], vector_step: int
+) -> dict[str, float]:
+    """Metrics of a chunk.
+
+    Args:
+      config: of the run.
+      algorithm: of the run.
+      counts: numbers from `run_chunk`.
+      vector_step: steps of all environments so far.
+
+    Returns:
+      Metrics by name; means over nothing are NaN.
+    """
+    c = {name: float(value) for name, value in counts.items()}
+    env_steps = vector_step * config.num_envs
+    epsilon = epsilon_at(config.exploration, jnp.asarray(env_steps))
+    learned = {
+        name: c[name] / c[count] if c[count] else float("nan")
+        for name, count in algorithm.metrics.items()
+    }
+    return {
+        "env_steps": env_steps,
+        "episodes": c["episodes"],
+        "successes": c["successes"],
+        **means(c),
+        **learned,
+        **{count: c[count] for count in dict.fromkeys(algorithm.metrics.values())},
+        "diverged": c["diverged"],
+        "epsilon": float(jnp.mean(spread_epsilon(config.exploration, epsilon, config.num_envs))),
+    }

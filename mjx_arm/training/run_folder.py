@@ -1,0 +1,190 @@
+"""The folder of a run: what is in it, who may write to it, and the results of each seed."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import datetime
+import json
+import os
+import pathlib
+from collections.abc import Iterator
+from typing import Any
+
+import filelock
+import jax
+
+from mjx_arm.config import TrainConfig, dump_config, parse_config
+from mjx_arm.training.objects import Record
+
+CONFIG = "config.json"
+EVALUATION = "evaluation.json"
+_LOCK = ".lock"
+
+
+@dataclasses.dataclass(frozen=True)
+class SavedRun:
+    """What a run's `config.json` says.
+
+    Attributes:
+      config: the options.
+      objects: record of the user's own objects.
+      scene: text of the scene.
+    """
+
+    config: TrainConfig
+    objects: Record
+    scene: str
+
+
+def save_run(folder: pathlib.Path, run: SavedRun) -> None:
+    """Writes `config.json` of a run and of each of its seeds: whole, or the ones before stay."""
+    seeds = seed_configs(run.config)
+    if len(seeds) > 1:
+        for own, config in zip(seed_folders(folder, run.config), seeds, strict=True):
+            own.mkdir(exist_ok=True)
+            _write(own, dataclasses.replace(run, config=config))
+    # Last: a folder that has this can be resumed.
+    _write(folder, run)
+
+
+def _write(folder: pathlib.Path, run: SavedRun) -> None:
+    content = dump_config(run.config) | {"objects": run.objects, "scene_text": run.scene}
+    part = folder / f"{CONFIG}.part"
+    part.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+    part.replace(folder / CONFIG)
+
+
+def load_run(folder: pathlib.Path) -> SavedRun:
+    """Reads `config.json` of a run folder.
+
+    Raises:
+      ValueError: the folder holds no configuration of this version.
+    """
+    path = folder / CONFIG
+    if not path.is_file():
+        raise ValueError(f"{folder} is not a run folder: it has no {CONFIG}")
+    return parse_run(read_text(path), str(path))
+
+
+def load_config(folder: pathlib.Path) -> TrainConfig:
+    """The options of a run folder; see `load_run`."""
+    return load_run(folder).config
+
+
+def parse_run(text: str, where: str) -> SavedRun:
+    """What the text of a `config.json` says.
+
+    Raises:
+      ValueError: it is not the configuration of a run of this version.
+    """
+    objects: Record = {}
+    scene = ""
+    with contextlib.suppress(json.JSONDecodeError):
+        values = json.loads(text)
+        if isinstance(values, dict):
+            objects = values.pop("objects", {})
+            scene = values.pop("scene_text", "")
+            text = json.dumps(values)
+    return SavedRun(parse_config(text, where), objects, scene)
+
+
+def read_text(path: pathlib.Path) -> str:
+    """The text of a file.
+
+    Raises:
+      ValueError: it cannot be read, or is not UTF-8.
+    """
+    try:
+        return path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise ValueError(f"{path} cannot be read: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{path} is not text in UTF-8") from error
+
+
+def seed_folders(folder: pathlib.Path, config: TrainConfig) -> list[pathlib.Path]:
+    """Where the results of each seed go."""
+    if config.num_seeds == 1:
+        return [folder]
+    return [folder / f"seed-{config.seed + i}" for i in range(config.num_seeds)]
+
+
+def seed_configs(config: TrainConfig) -> list[TrainConfig]:
+    """The configuration of each seed's own run."""
+    return [
+        dataclasses.replace(config, seed=config.seed + i, num_seeds=1)
+        for i in range(config.num_seeds)
+    ]
+
+
+@contextlib.contextmanager
+def locked(folder: pathlib.Path) -> Iterator[None]:
+    """Makes this process the only one that writes to a run folder.
+
+    Raises:
+      ValueError: another process has the lock.
+    """
+    lock = filelock.FileLock(folder / _LOCK)
+    try:
+        lock.acquire(timeout=0)
+    except filelock.Timeout:
+        raise ValueError(
+            f"{folder} is in use by another process: wait until it ends, or give another folder"
+        ) from None
+    except OSError as error:
+        raise ValueError(f"{folder} cannot be written: {error.strerror}") from error
+    try:
+        yield
+    finally:
+        lock.release()
+
+
+def new_run_folder(name: str) -> pathlib.Path:
+    """Makes a folder in `runs`, named by the time, and with a number where that name is taken.
+
+    Raises:
+      ValueError: it cannot be made.
+    """
+    runs, stem = pathlib.Path("runs"), f"{datetime.datetime.now():%Y-%m-%d-%H%M%S}-{name}"
+    folder, number = runs / stem, 1
+    try:
+        runs.mkdir(exist_ok=True)
+        while True:
+            # Not `exist_ok`: runs that a cluster starts in one second must not share a folder.
+            with contextlib.suppress(FileExistsError):
+                folder.mkdir()
+                return folder
+            number += 1
+            folder = runs / f"{stem}-{number}"
+    except OSError as error:
+        raise _cannot_be_made(folder, error) from error
+
+
+def _cannot_be_made(folder: pathlib.Path, error: OSError) -> ValueError:
+    return ValueError(f"{folder} cannot be made ({error.strerror}): give --out another folder")
+
+
+def prepare_folder(folder: pathlib.Path) -> pathlib.Path:
+    """Makes the run folder, and returns it.
+
+    Raises:
+      ValueError: it is a file, holds something already, or cannot be written.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        occupied = any(path.name != _LOCK for path in folder.iterdir())
+    except (FileExistsError, NotADirectoryError) as error:
+        raise ValueError(f"{folder} is a file: give --out a new or empty folder") from error
+    except OSError as error:
+        raise _cannot_be_made(folder, error) from error
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise ValueError(f"{folder} cannot be written: give --out another folder")
+    if occupied:
+        raise ValueError(f"{folder} is not empty: give --out a new or empty folder")
+    return folder
+
+
+def of_seed(tree: Any, config: TrainConfig, i: int) -> Any:
+    """The part of one seed in what a trainer returns for all of them."""
+    return tree if config.num_seeds == 1 else jax.tree.map(lambda x: x[i], tree)

@@ -1,0 +1,550 @@
+"""A training run from outside: chunks of the compiled loop, and what becomes of their results."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import json
+import math
+import pathlib
+import shlex
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from types import FrameType, TracebackType
+from typing import Any, Self
+
+import flax.traverse_util
+import jax
+import jax.numpy as jnp
+from rich.console import Console
+
+from mjx_arm.algos.collect import Counts
+from mjx_arm.config import TrainConfig, set_train_options
+from mjx_arm.envs.env import make_env
+from mjx_arm.report.figures import plot_curves
+from mjx_arm.report.metrics import MetricsWriter, keep_metrics, last_env_steps, last_wall_s
+from mjx_arm.report.progress import (
+    describe,
+    make_progress,
+    say_device,
+    say_memory,
+    say_working_memory,
+)
+from mjx_arm.report.video import draw_episode, record_episode, write_video
+from mjx_arm.training.agent import (
+    BEST,
+    LAST,
+    evaluation_config,
+    find_agent,
+    flatten_params,
+    load_agent,
+    read_agent,
+    read_selection_rate,
+    save_agent,
+)
+from mjx_arm.training.checkpoint import RunCheckpoints
+from mjx_arm.training.evaluate import Evaluation, evaluate, make_evaluator
+from mjx_arm.training.loop import (
+    EVALUATION as EVALUATION_ROLE,
+)
+from mjx_arm.training.loop import (
+    SELECTION,
+    LoopState,
+    Trainer,
+    make_trainer,
+    role_key,
+    run_keys,
+    summarise,
+)
+from mjx_arm.training.memory import check_memory, memory_plan, working_memory
+from mjx_arm.training.objects import Objects, check_record, record
+from mjx_arm.training.run_folder import (
+    EVALUATION,
+    SavedRun,
+    load_run,
+    locked,
+    new_run_folder,
+    of_seed,
+    prepare_folder,
+    save_run,
+    seed_configs,
+    seed_folders,
+)
+
+# Held out: their keys have roles of their own, so no seed of a training meets them.
+_SELECTION_SEED = 2_000_003
+_EVALUATION_SEED = 1_000_003
+_EVALUATION_EPSILON = 0.1
+Evaluate = Callable[[Any], Evaluation]
+RunChunk = Callable[[LoopState], tuple[LoopState, Counts]]
+# Called between two chunks with the metrics of each seed and the state.
+OnChunk = Callable[[list[dict[str, float]], LoopState], None]
+# Chunks between two checkpoints.
+_SAVE_EVERY = 10
+_SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP", "SIGUSR1")
+
+
+class RunInterruptedError(Exception):
+    """The user asked a run to stop; its state is saved."""
+
+
+def train(
+    config: TrainConfig,
+    folder: str | pathlib.Path | None = None,
+    *,
+    eval_episodes: int = 200,
+    stop_at: float | None = None,
+    init_from: str | pathlib.Path | None = None,
+    on_chunk: OnChunk | None = None,
+    console: Console | None = None,
+    env: Any = None,
+    network: Any = None,
+    reward: Any = None,
+    algorithm: Any = None,
+) -> list[Evaluation]:
+    """Trains an agent and leaves metrics, curves, agents, an evaluation and a video.
+
+    With several seeds each has all this in a folder of its own, `seed-0` and so on.
+
+    Args:
+      config: the options.
+      folder: the run folder; made, must be new or empty. None for a new one in `runs`, named by
+        the time.
+      eval_episodes: episodes of the evaluation at the end.
+      stop_at: end the run when a selection has reached this success rate for every seed.
+      init_from: an agent whose network the run starts from.
+      on_chunk: called after each chunk with the metrics of each seed and the state, which it may
+        read until it returns.
+      console: where it prints; by default the terminal.
+      env: an environment of one's own.
+      network: a Flax module `observations [B, ...] -> Q-values [B, A]` of one's own.
+      reward: a function `(before, after, action) -> terms` of one's own; see `mjx_arm.make`.
+      algorithm: makes an algorithm of one's own; see `make_trainer`.
+
+    Returns:
+      The evaluation of each seed.
+
+    Raises:
+      ValueError: the options do not fit the machine, or the folder cannot be used.
+      RunInterruptedError: Ctrl-C, SIGTERM, SIGHUP or SIGUSR1.
+    """
+    _check_options(eval_episodes, stop_at)
+    console = Console(highlight=False) if console is None else console
+    objects = Objects(env=env, network=network, reward=reward, algorithm=algorithm)
+    trainer = _prepare(config, objects, console)
+    recorded = record(config, objects)
+    folder = (
+        new_run_folder(config.env.env) if folder is None else prepare_folder(pathlib.Path(folder))
+    )
+    with locked(folder):
+        console.print(f"run folder: {folder}", soft_wrap=True)
+        run_chunk = _compile(trainer, console)
+        state = trainer.init(run_keys(config))
+        if init_from is not None:
+            state = _start_from(trainer, state, pathlib.Path(init_from))
+        run = SavedRun(_with_backend(config, trainer), recorded, trainer.env.scene.xml)
+        save_run(folder, run)
+        loop = _Loop(trainer, run, run_chunk, folder, console, stop_at, on_chunk)
+        loop.run(state, 0)
+        return _finish(folder, run, objects, eval_episodes, console)
+
+
+def resume(
+    folder: str | pathlib.Path,
+    *,
+    total_steps: int | None = None,
+    eval_episodes: int = 200,
+    stop_at: float | None = None,
+    on_chunk: OnChunk | None = None,
+    console: Console | None = None,
+    env: Any = None,
+    network: Any = None,
+    reward: Any = None,
+    algorithm: Any = None,
+) -> list[Evaluation]:
+    """Continues a run from its newest checkpoint, as if it had never stopped.
+
+    Resuming is bit-exact on the same CPU with the same number of threads. On other hardware the
+    run continues, but not bit for bit.
+
+    Args:
+      folder: the run folder.
+      total_steps: environment steps of the whole run, more than before; by default as planned. The
+        selection that ended a shorter run is kept.
+      eval_episodes: episodes of the evaluation at the end.
+      stop_at: end the run when a selection has reached this success rate for every seed.
+      on_chunk: see `train`.
+      console: where it prints.
+      env: the environment, if the run was started with one.
+      network: the same for the network.
+      reward: the same for the reward.
+      algorithm: the same for the algorithm.
+
+    Raises:
+      ValueError: the folder holds no run that can be continued, or an object is not the run's.
+      RunInterruptedError: Ctrl-C, SIGTERM, SIGHUP or SIGUSR1.
+    """
+    _check_options(eval_episodes, stop_at)
+    folder = pathlib.Path(folder)
+    console = Console(highlight=False) if console is None else console
+    _check_whole_run(folder)
+    saved = load_run(folder)
+    objects = Objects(env=env, network=network, reward=reward, algorithm=algorithm)
+    check_record(saved.objects, saved.config, objects, str(folder))
+    config = saved.config
+    if total_steps is not None:
+        config = dataclasses.replace(config, total_steps=total_steps)
+    with locked(folder):
+        console.print(f"run folder: {folder}", soft_wrap=True)
+        trainer = _prepare(config, objects, console)
+        checkpoints = RunCheckpoints(folder)
+        saved_any = _has_saved(trainer, folder)
+        vector_step = checkpoints.find_newest(_shapes(trainer)) if saved_any else 0
+        done = vector_step * config.num_envs
+        if config.total_steps < min(done, saved.config.total_steps):
+            raise ValueError(
+                f"--total-steps must be at least {done}, which the run has made already, "
+                f"got {total_steps}"
+            )
+        # Before the state is allocated, or the memory check would count it twice.
+        run_chunk = _compile(trainer, console)
+        if saved_any:
+            state = checkpoints.load(vector_step, _shapes(trainer))
+        else:
+            state = trainer.init(run_keys(config))
+        run = dataclasses.replace(saved, config=config)
+        if config != saved.config:
+            save_run(folder, run)
+        for seed_folder in seed_folders(folder, config):
+            keep_metrics(seed_folder, done)
+        console.print(f"resuming after {done:,} steps")
+        loop = _Loop(trainer, run, run_chunk, folder, console, stop_at, on_chunk)
+        loop.run(state, vector_step // config.chunk_length)
+        return _finish(folder, run, objects, eval_episodes, console)
+
+
+def _with_backend(config: TrainConfig, trainer: Trainer) -> TrainConfig:
+    """With the backend by name: on another device, `auto` may mean another, with other states."""
+    return set_train_options(config, {"physics": trainer.env.physics.backend})
+
+
+def _start_from(trainer: Trainer, state: LoopState, path: pathlib.Path) -> LoopState:
+    """The state with the parameters of an agent."""
+    path = find_agent(path)
+    tensors = read_agent(path)[1]
+    policy = trainer.algorithm.policy(state.learner)
+    flat = flatten_params(policy)
+    seeds = () if trainer.config.num_seeds == 1 else (trainer.config.num_seeds,)
+    shapes = {name: x.shape[len(seeds) :] for name, x in flat.items()}
+    if {name: x.shape for name, x in tensors.items()} != shapes:
+        raise ValueError(
+            f"--init-from {path} holds the parameters of another network than this run trains"
+        )
+    arrays = {name: jnp.broadcast_to(tensors[name], (*seeds, *shapes[name])) for name in flat}
+    params = flax.traverse_util.unflatten_dict(arrays, sep="/")
+    learner = trainer.algorithm.with_policy(state.learner, params)
+    return dataclasses.replace(state, learner=learner)
+
+
+def _check_options(eval_episodes: int, stop_at: float | None) -> None:
+    if eval_episodes < 1:
+        raise ValueError(f"eval_episodes must be at least 1, got {eval_episodes}")
+    if stop_at is not None and not 0.0 < stop_at <= 1.0:
+        raise ValueError(f"stop_at must be above 0 and at most 1, got {stop_at}")
+
+
+def _check_whole_run(folder: pathlib.Path) -> None:
+    """Refuses the folder of one seed of several, whose checkpoints are those of all."""
+    parent = folder.resolve().parent
+    if not (parent / "config.json").is_file():
+        return
+    seeds = seed_folders(parent, load_run(parent).config)
+    if len(seeds) > 1 and folder.resolve() in seeds:
+        raise ValueError(f"{folder} is one seed of several: give the folder of all, {parent}")
+
+
+def _has_saved(trainer: Trainer, folder: pathlib.Path) -> bool:
+    """Whether a run got as far as its first checkpoint; that may be its last."""
+    config = trainer.config
+    unsaved = _SAVE_EVERY * config.chunk_length * config.num_envs
+    first = seed_folders(folder, config)[0]
+    ended = (first / EVALUATION).is_file()
+    return ended or RunCheckpoints(folder).newest() is not None or last_env_steps(first) > unsaved
+
+
+def _prepare(config: TrainConfig, objects: Objects, console: Console) -> Trainer:
+    say_device(console)
+    trainer = make_trainer(config, **objects.given())
+    plan = memory_plan(_shapes(trainer))
+    say_memory(console, plan)
+    check_memory(plan)
+    return trainer
+
+
+def _shapes(trainer: Trainer) -> LoopState:
+    return jax.eval_shape(trainer.init, run_keys(trainer.config))
+
+
+def _compile(trainer: Trainer, console: Console) -> RunChunk:
+    """The compiled chunk; refused where what it needs to work in does not fit beside the state."""
+    console.print("compiling")
+    shapes = _shapes(trainer)
+    compiled = trainer.run_chunk.lower(shapes).compile()
+    simulations = trainer.config.num_seeds * trainer.config.num_envs
+    working = working_memory(compiled, trainer.env.physics, simulations)
+    plan = memory_plan(shapes) | {"working": working}
+    say_working_memory(console, plan)
+    check_memory(plan)
+    return compiled
+
+
+class _Results:
+    """What the chunks of one seed leave on disk: metrics, the last agent, and the best one."""
+
+    def __init__(
+        self,
+        folder: pathlib.Path,
+        run: SavedRun,
+        trainer: Trainer,
+        evaluate_params: Evaluate,
+        started: float,
+    ):
+        self.folder, self.run, self.config = folder, run, run.config
+        self._algorithm = trainer.algorithm
+        self._evaluate = evaluate_params
+        self.best = read_selection_rate(folder / BEST)
+        self._wall_before = last_wall_s(folder)
+        self._started = started
+        self.writer = MetricsWriter(folder)
+
+    def add(
+        self, counts: Counts, params: Any, chunk: int, *, seconds: float, select: bool
+    ) -> dict[str, float]:
+        """Writes the metrics of a chunk, the selection's included, and returns them."""
+        length = self.config.chunk_length
+        metrics = summarise(self.config, self._algorithm, counts, chunk * length)
+        metrics["steps_per_s"] = length * self.config.num_envs / seconds
+        metrics["selection_rate"] = math.nan
+        if select:
+            metrics["selection_rate"] = self._select(params, int(metrics["env_steps"]))
+        metrics["wall_s"] = self._wall_before + time.perf_counter() - self._started
+        self.writer.write(metrics)
+        return metrics
+
+    def _select(self, params: Any, env_steps: int) -> float:
+        rate = self._evaluate(params).rate
+        # The later of two equal ones: it has seen more.
+        if self.best is None or rate >= self.best:
+            self.best = rate
+            self._save(BEST, params, env_steps, rate)
+        return rate
+
+    def save_last(self, params: Any, env_steps: int) -> None:
+        self._save(LAST, params, env_steps, None)
+
+    def _save(self, name: str, params: Any, env_steps: int, rate: float | None) -> None:
+        save_agent(
+            self.folder / name,
+            self.config,
+            params,
+            scene=self.run.scene,
+            objects=self.run.objects,
+            env_steps=env_steps,
+            selection_rate=rate,
+        )
+
+
+@dataclasses.dataclass
+class _Loop:
+    """The chunks of a run, one after another."""
+
+    trainer: Trainer
+    saved: SavedRun
+    run_chunk: RunChunk
+    folder: pathlib.Path
+    console: Console
+    stop_at: float | None
+    on_chunk: OnChunk | None
+
+    def run(self, state: LoopState, done: int) -> None:
+        """Runs all chunks after the first `done`."""
+        config, started = self.trainer.config, time.perf_counter()
+        checkpoints = RunCheckpoints(self.folder)
+        per_chunk = config.chunk_length * config.num_envs
+        with contextlib.ExitStack() as stack:
+            stack.enter_context(_offering(checkpoints))
+            interruption = stack.enter_context(_Interruption())
+            progress = stack.enter_context(make_progress(self.console))
+            results = self._results(started)
+            for result in results:
+                stack.enter_context(result.writer)
+            task = progress.add_task("", total=config.num_chunks * per_chunk, metrics="")
+            for chunk in range(done + 1, config.num_chunks + 1):
+                state, rows, params = self._advance(state, results, chunk)
+                progress.update(task, completed=chunk * per_chunk, metrics=describe(rows))
+                if self.on_chunk is not None:
+                    self.on_chunk(rows, state)
+                reached = self._has_reached(results)
+                last = chunk == config.num_chunks or reached
+                if last or chunk % _SAVE_EVERY == 0 or interruption.asked:
+                    # The checkpoint last: what is older than it would not be made again.
+                    for result, own in zip(results, params, strict=True):
+                        result.save_last(own, chunk * per_chunk)
+                    checkpoints.save(chunk * config.chunk_length, state)
+                if interruption.asked and not last:
+                    command = shlex.join(
+                        [sys.executable, "-m", "mjx_arm", "train", "--resume", str(self.folder)]
+                    )
+                    raise RunInterruptedError(f"saved; continue with: {command}")
+                if reached:
+                    self.console.print(f"stopped: every seed has reached {self.stop_at}")
+                    return
+
+    def _results(self, started: float) -> list[_Results]:
+        config = self.trainer.config
+        judged = make_env(evaluation_config(config.env), reward=self.trainer.env.reward)
+        evaluator = make_evaluator(
+            judged,
+            self.trainer.algorithm.apply,
+            episodes=config.select_episodes,
+            epsilon=_EVALUATION_EPSILON,
+        )
+
+        def evaluate_params(params: Any) -> Evaluation:
+            return evaluator(params, role_key(_SELECTION_SEED, SELECTION))
+
+        folders = seed_folders(self.folder, config)
+        return [
+            _Results(
+                own,
+                dataclasses.replace(self.saved, config=seed_config),
+                self.trainer,
+                evaluate_params,
+                started,
+            )
+            for own, seed_config in zip(folders, seed_configs(config), strict=True)
+        ]
+
+    def _advance(
+        self, state: LoopState, results: list[_Results], chunk: int
+    ) -> tuple[LoopState, list[dict[str, float]], list[Any]]:
+        """One chunk: the state after, and the metrics and the policy of each seed."""
+        config = self.trainer.config
+        before = time.perf_counter()
+        state, counts = self.run_chunk(state)
+        counts = jax.device_get(counts)
+        seconds = time.perf_counter() - before
+        last = chunk == config.num_chunks
+        select = config.select_every > 0 and (last or _is_due(config, chunk))
+        policy = self.trainer.algorithm.policy(state.learner)
+        params = [of_seed(policy, config, i) for i in range(len(results))]
+        rows = [
+            result.add(of_seed(counts, config, i), params[i], chunk, seconds=seconds, select=select)
+            for i, result in enumerate(results)
+        ]
+        return state, rows, params
+
+    def _has_reached(self, results: list[_Results]) -> bool:
+        if self.stop_at is None:
+            return False
+        return all(result.best is not None and result.best >= self.stop_at for result in results)
+
+
+@contextlib.contextmanager
+def _offering(checkpoints: RunCheckpoints) -> Iterator[None]:
+    """Adds to an error about a file which checkpoint is whole, in the same sentence."""
+    try:
+        yield
+    except (OSError, ValueError) as error:
+        said = str(error)
+        if isinstance(error, OSError):
+            said = f"{error.filename or checkpoints.folder}: {error.strerror or error}"
+        newest = checkpoints.newest()
+        offer = f"; --resume continues from {newest}, which is whole" if newest else ""
+        raise ValueError(f"{said}{offer}") from error
+
+
+def _is_due(config: TrainConfig, chunk: int) -> bool:
+    """Whether a selection falls into this chunk."""
+    per_chunk = config.chunk_length * config.num_envs
+    return chunk * per_chunk // config.select_every > (chunk - 1) * per_chunk // config.select_every
+
+
+class _Interruption:
+    """Turns the first signal into a wish to stop after the chunk; the second acts as before."""
+
+    def __init__(self) -> None:
+        self.asked = False
+        self._before: dict[int, Any] = {}
+
+    def __enter__(self) -> Self:
+        # Only the main thread may set handlers.
+        if threading.current_thread() is threading.main_thread():
+            numbers = [getattr(signal, name) for name in _SIGNALS if hasattr(signal, name)]
+            self._before = {number: signal.signal(number, self._handle) for number in numbers}
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+
+    def _handle(self, number: int, frame: FrameType | None) -> None:
+        before = self._before[number]
+        if self.asked and callable(before):
+            before(number, frame)
+        self.asked = True
+
+
+def _finish(
+    folder: pathlib.Path,
+    run: SavedRun,
+    objects: Objects,
+    eval_episodes: int,
+    console: Console,
+) -> list[Evaluation]:
+    folders = seed_folders(folder, run.config)
+    if len(folders) > 1:
+        for path in plot_curves(folders, into=folder):
+            console.print(f"curves: {path}", soft_wrap=True)
+    return [_finish_seed(own, objects, eval_episodes, console) for own in folders]
+
+
+def _finish_seed(
+    folder: pathlib.Path, objects: Objects, eval_episodes: int, console: Console
+) -> Evaluation:
+    for path in plot_curves([folder], into=folder):
+        console.print(f"curves: {path}", soft_wrap=True)
+    agent = load_agent(folder, network=objects.network, reward=objects.reward)
+    console.print(f"agent: {find_agent(folder)}, after {agent.env_steps:,} steps", soft_wrap=True)
+    key = role_key(_EVALUATION_SEED, EVALUATION_ROLE)
+    result = evaluate(
+        agent.env,
+        agent.apply,
+        agent.params,
+        episodes=eval_episodes,
+        epsilon=_EVALUATION_EPSILON,
+        key=key,
+    )
+    (folder / EVALUATION).write_text(json.dumps(dataclasses.asdict(result)) + "\n")
+    low, high = result.ci95
+    console.print(
+        f"evaluation: {result.successes} of {result.episodes} episodes succeeded, "
+        f"{100 * result.rate:.1f} % (95 % interval {100 * low:.1f} to {100 * high:.1f})"
+    )
+    episode = record_episode(
+        agent.env, agent.apply, agent.params, epsilon=_EVALUATION_EPSILON, key=key
+    )
+    path = folder / "policy.mp4"
+    write_video(path, draw_episode(agent.env, episode))
+    console.print(
+        f"video: {path} ({len(episode)} frames, success: {episode.success})", soft_wrap=True
+    )
+    return result
