@@ -280,6 +280,14 @@ class TrainConfig:
         return self.replay.replay_size // self.num_envs
 
     @property
+    def samples_per_step(self) -> float:
+        """Transitions that learning samples for each environment step."""
+        if isinstance(self.algo, DistillConfig):
+            return self.algo.teacher_batch_size / self.num_envs
+        assert isinstance(self.algo, DQNConfig)
+        return self.algo.batch_size * self.algo.updates_per_step / self.num_envs
+
+    @property
     def chunk_length(self) -> int:
         """Steps of all environments in one compiled call."""
         return max(1, self.chunk_steps // self.num_envs)
@@ -310,6 +318,29 @@ def set_train_options(config: TrainConfig, values: Mapping[str, Any]) -> TrainCo
         check_name("algorithm", algorithm, _ALGORITHMS)
         config = dataclasses.replace(config, algorithm=algorithm, algo=_ALGORITHMS[algorithm]())
     return set_options(config, values)
+
+
+def advice(config: TrainConfig) -> list[str]:
+    """Sentences about options that are valid, but unlikely to be wanted."""
+    said = []
+    if config.chunk_length < 16:
+        said.append(
+            f"a chunk has {config.chunk_length} steps of {config.num_envs} environments, so that "
+            f"most of the time goes to the pauses between chunks: give --chunk-steps "
+            f"{256 * config.num_envs}"
+        )
+    needed = max(config.env.max_steps // 4, 8 * config.algo.n_step)
+    if config.replay_slots < needed:
+        said.append(
+            f"the replay holds {config.replay_slots} steps of each environment, less than a "
+            f"quarter of an episode: give --replay-size {config.env.max_steps * config.num_envs}"
+        )
+    if config.samples_per_step < 0.25:
+        said.append(
+            f"training samples {config.samples_per_step:.2g} transitions for each environment "
+            f"step; runs that learnt had 1 to 8: give a larger batch or more updates per step"
+        )
+    return said
 
 
 def train_config(**values: Any) -> TrainConfig:

@@ -5,10 +5,17 @@ from __future__ import annotations
 import math
 import pathlib
 import shutil
+import time
+from types import TracebackType
+from typing import Self
 
 import jax
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, Progress, TextColumn
+
+_SECONDS_BETWEEN_LINES = 30.0
+# Episodes that the shown success rate averages over.
+_SMOOTHING = 200.0
 
 
 def say_device(console: Console) -> None:
@@ -34,32 +41,109 @@ def say_working_memory(console: Console, plan: dict[str, int]) -> None:
     console.print(f"memory: {working:.1f} MB more to work in; {total:.1f} MB in all")
 
 
-def make_progress(console: Console) -> Progress:
-    """A progress bar over environment steps with room for the metrics of the last chunk."""
-    return Progress(
-        TextColumn("{task.completed:,.0f}"),
-        BarColumn(bar_width=8),
-        TextColumn("{task.fields[metrics]}"),
-        TimeRemainingColumn(),
-        console=console,
+class RunProgress:
+    """The progress of a training run: a bar in a terminal, plain lines anywhere else.
+
+    Without a terminal (a pipe, a scheduler's log) it prints a line at least every 30 seconds, as
+    soon as a chunk has ended.
+
+    Args:
+      console: where it prints.
+      total: environment steps of the whole run.
+      done: environment steps that were made before.
+    """
+
+    def __init__(self, console: Console, total: int, done: int = 0):
+        self._console, self._total, self._done = console, total, done
+        self._success = _Smoothed()
+        self._speed = _Smoothed()
+        self._last_line = -math.inf
+        self._bar = Progress(
+            TextColumn("{task.completed:,.0f} of {task.total:,.0f} ({task.percentage:.0f} %)"),
+            BarColumn(bar_width=10),
+            TextColumn("{task.fields[metrics]}"),
+            console=console,
+            disable=not console.is_terminal,
+        )
+        self._task = self._bar.add_task("", total=total, completed=done, metrics="")
+
+    def __enter__(self) -> Self:
+        self._bar.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._bar.stop()
+
+    def update(self, completed: int, rows: list[dict[str, float]]) -> None:
+        """Shows a chunk.
+
+        Args:
+          completed: environment steps so far.
+          rows: the metrics of each seed.
+        """
+        metrics = {name: sum(row[name] for row in rows) / len(rows) for name in rows[0]}
+        self._success.add(metrics["success_rate"], metrics["episodes"])
+        self._speed.add(1.0 / metrics["steps_per_s"], 1.0)
+        left = (self._total - completed) * self._speed.mean
+        text = self._describe(metrics, left)
+        self._bar.update(self._task, completed=completed, metrics=text)
+        now = time.monotonic()
+        due = now - self._last_line >= _SECONDS_BETWEEN_LINES or completed >= self._total
+        if not self._console.is_terminal and due:
+            self._last_line = now
+            share = 100 * completed / self._total
+            self._console.print(
+                f"{completed:,} of {self._total:,} steps ({share:.0f} %), {text}", soft_wrap=True
+            )
+
+    def phase(self, name: str) -> None:
+        """Says what is being done between two chunks."""
+        self._bar.update(self._task, metrics=name)
+        if not self._console.is_terminal:
+            self._console.print(name, soft_wrap=True)
+
+    def _describe(self, metrics: dict[str, float], seconds_left: float) -> str:
+        parts = [f"{metrics['steps_per_s']:,.0f} steps/s"]
+        if not math.isnan(self._success.mean):
+            parts.append(f"success {100 * self._success.mean:.0f} %")
+        parts.append(f"max Q {metrics['q_mean']:.1f}")
+        parts.append(f"ε {metrics['epsilon']:.2f}")
+        parts.append(f"{_minutes(seconds_left)} left")
+        return ", ".join(parts)
+
+
+class _Smoothed:
+    """A weighted mean of the newest values, over a weight of about 200."""
+
+    def __init__(self) -> None:
+        self._sum, self._weight = 0.0, 0.0
+
+    def add(self, value: float, weight: float) -> None:
+        if math.isnan(value) or weight <= 0.0:
+            return
+        keep = math.exp(-weight / _SMOOTHING)
+        self._sum = keep * self._sum + weight * value
+        self._weight = keep * self._weight + weight
+
+    @property
+    def mean(self) -> float:
+        return self._sum / self._weight if self._weight else math.nan
+
+
+def _minutes(seconds: float) -> str:
+    if math.isnan(seconds):
+        return "unknown time"
+    minutes, rest = divmod(round(seconds), 60)
+    return (
+        f"{minutes // 60} h {minutes % 60:02d} min"
+        if minutes >= 60
+        else f"{minutes}:{rest:02d} min"
     )
-
-
-def describe(rows: list[dict[str, float]]) -> str:
-    """One line of a chunk's metrics, means over the seeds."""
-    metrics = {name: sum(row[name] for row in rows) / len(rows) for name in rows[0]}
-    parts = [
-        f"{metrics['steps_per_s']:,.0f}/s",
-        f"success {_percent(metrics['success_rate'])}",
-        f"max Q {metrics['q_mean']:.1f}",
-        f"loss {metrics['loss']:.3f}",
-        f"ε {metrics['epsilon']:.2f}",
-    ]
-    return " ".join(parts)
-
-
-def _percent(share: float) -> str:
-    return "  – " if math.isnan(share) else f"{100 * share:3.0f}%"
 
 
 def _has_nvidia_card() -> bool:

@@ -22,17 +22,11 @@ import jax.numpy as jnp
 from rich.console import Console
 
 from mjx_arm.algos.collect import Counts
-from mjx_arm.config import TrainConfig, set_train_options
+from mjx_arm.config import TrainConfig, advice, set_train_options
 from mjx_arm.envs.env import make_env
 from mjx_arm.report.figures import plot_curves
 from mjx_arm.report.metrics import MetricsWriter, keep_metrics, last_env_steps, last_wall_s
-from mjx_arm.report.progress import (
-    describe,
-    make_progress,
-    say_device,
-    say_memory,
-    say_working_memory,
-)
+from mjx_arm.report.progress import RunProgress, say_device, say_memory, say_working_memory
 from mjx_arm.report.video import draw_episode, record_episode, write_video
 from mjx_arm.training.agent import (
     BEST,
@@ -148,6 +142,7 @@ def train(
         run = SavedRun(_with_backend(config, trainer), recorded, trainer.env.scene.xml)
         save_run(folder, run)
         loop = _Loop(trainer, run, run_chunk, folder, console, stop_at, on_chunk)
+        console.print(f"training: {config.total_steps:,} environment steps")
         loop.run(state, 0)
         return _finish(folder, run, objects, eval_episodes, console)
 
@@ -277,6 +272,8 @@ def _has_saved(trainer: Trainer, folder: pathlib.Path) -> bool:
 
 def _prepare(config: TrainConfig, objects: Objects, console: Console) -> Trainer:
     say_device(console)
+    for sentence in advice(config):
+        console.print(f"[yellow]warning: {sentence}[/yellow]", soft_wrap=True)
     trainer = make_trainer(config, **objects.given())
     plan = memory_plan(_shapes(trainer))
     say_memory(console, plan)
@@ -290,7 +287,7 @@ def _shapes(trainer: Trainer) -> LoopState:
 
 def _compile(trainer: Trainer, console: Console) -> RunChunk:
     """The compiled chunk; refused where what it needs to work in does not fit beside the state."""
-    console.print("compiling")
+    console.print("compiling: about half a minute")
     shapes = _shapes(trainer)
     compiled = trainer.run_chunk.lower(shapes).compile()
     simulations = trainer.config.num_seeds * trainer.config.num_envs
@@ -377,14 +374,14 @@ class _Loop:
         with contextlib.ExitStack() as stack:
             stack.enter_context(_offering(checkpoints))
             interruption = stack.enter_context(_Interruption())
-            progress = stack.enter_context(make_progress(self.console))
+            total = config.num_chunks * per_chunk
+            progress = stack.enter_context(RunProgress(self.console, total, done * per_chunk))
             results = self._results(started)
             for result in results:
                 stack.enter_context(result.writer)
-            task = progress.add_task("", total=config.num_chunks * per_chunk, metrics="")
             for chunk in range(done + 1, config.num_chunks + 1):
-                state, rows, params = self._advance(state, results, chunk)
-                progress.update(task, completed=chunk * per_chunk, metrics=describe(rows))
+                state, rows, params = self._advance(state, results, chunk, progress)
+                progress.update(chunk * per_chunk, rows)
                 if self.on_chunk is not None:
                     self.on_chunk(rows, state)
                 reached = self._has_reached(results)
@@ -429,7 +426,7 @@ class _Loop:
         ]
 
     def _advance(
-        self, state: LoopState, results: list[_Results], chunk: int
+        self, state: LoopState, results: list[_Results], chunk: int, progress: RunProgress
     ) -> tuple[LoopState, list[dict[str, float]], list[Any]]:
         """One chunk: the state after, and the metrics and the policy of each seed."""
         config = self.trainer.config
@@ -439,6 +436,8 @@ class _Loop:
         seconds = time.perf_counter() - before
         last = chunk == config.num_chunks
         select = config.select_every > 0 and (last or _is_due(config, chunk))
+        if select:
+            progress.phase(f"selecting: {config.select_episodes} episodes")
         policy = self.trainer.algorithm.policy(state.learner)
         params = [of_seed(policy, config, i) for i in range(len(results))]
         rows = [
@@ -522,6 +521,7 @@ def _finish_seed(
 ) -> Evaluation:
     for path in plot_curves([folder], into=folder):
         console.print(f"curves: {path}", soft_wrap=True)
+    console.print(f"evaluating: {eval_episodes} episodes")
     agent = load_agent(folder, network=objects.network, reward=objects.reward)
     console.print(f"agent: {find_agent(folder)}, after {agent.env_steps:,} steps", soft_wrap=True)
     key = role_key(_EVALUATION_SEED, EVALUATION_ROLE)
@@ -539,6 +539,7 @@ def _finish_seed(
         f"evaluation: {result.successes} of {result.episodes} episodes succeeded, "
         f"{100 * result.rate:.1f} % (95 % interval {100 * low:.1f} to {100 * high:.1f})"
     )
+    console.print("rendering a video")
     episode = record_episode(
         agent.env, agent.apply, agent.params, epsilon=_EVALUATION_EPSILON, key=key
     )
