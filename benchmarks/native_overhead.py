@@ -92,7 +92,7 @@ def main() -> None:
     args = parser.parse_args()
 
     scene = load_scene("arm_cube")
-    physics = make_physics(scene, "native")
+    physics = make_physics(scene.mj_model, "native", substeps=2)
     rows = []
     print(f"iterations/s of {physics.substeps} substeps: best of {args.repeats}, and median")
     print("   envs          native            loop   native/loop")

@@ -5,11 +5,12 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
+from mjx_arm.physics import BACKENDS
+
 OBSERVATIONS = ("rgb", "rgbd", "segmentation", "state", "packed")
 REWARDS = ("paper", "completion", "progress")
 CUBE_MOVES = ("never", "on_success", "always")
 STARTS = ("home", "in_grasp")
-BACKENDS = ("auto", "mjx", "mjx-warp", "native")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -259,7 +259,12 @@ def make_env(config: EnvConfig) -> Env:
         config=config,
         scene=scene,
         ids=ids,
-        physics=make_physics(scene, config.physics),
+        physics=make_physics(
+            scene.mj_model,
+            config.physics,
+            substeps=ids.substeps,
+            mjx_iterations=tuple(ids.mjx_iterations),
+        ),
         starts=Starts(scene, ids, config),
         render=make_renderer(
             scene,

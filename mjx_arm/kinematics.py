@@ -15,6 +15,8 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from mjx_arm.varies import Params, Varies, fill
+
 _FREE = int(mujoco.mjtJoint.mjJNT_FREE)
 _HINGE = int(mujoco.mjtJoint.mjJNT_HINGE)
 _SLIDE = int(mujoco.mjtJoint.mjJNT_SLIDE)
@@ -35,14 +37,15 @@ class Poses:
     site_xpos: jax.Array
 
 
-def make_kinematics(mj_model: mujoco.MjModel) -> Callable[[jax.Array], Poses]:
+def make_kinematics(mj_model: mujoco.MjModel, varies: Varies | None = None) -> Callable[..., Poses]:
     """Makes `poses(qpos)`, MuJoCo's `mj_kinematics` for free, hinge and slide joints.
 
     Args:
       mj_model: a model without ball joints and mocap bodies.
+      varies: what varies by episode; `geom_pos`, `geom_quat`, `body_pos` and `body_quat` are read.
 
     Returns:
-      A pure function from `qpos [nq] float32` to `Poses`.
+      A pure function from `qpos [nq] float32` and params to `Poses`.
 
     Raises:
       ValueError: the model has a joint or body that is not supported.
@@ -56,20 +59,27 @@ def make_kinematics(mj_model: mujoco.MjModel) -> Callable[[jax.Array], Poses]:
     if mj_model.nmocap:
         raise ValueError("the scene has mocap bodies, which are not supported")
 
-    def poses(qpos: jax.Array) -> Poses:
+    varies = {} if varies is None else varies
+
+    def poses(qpos: jax.Array, params: Params | None = None) -> Poses:
+        # Fields that do not vary keep the model's float64 values.
+        geom_pos, geom_quat, body_pos, body_quat = (
+            fill(mj_model, varies, params, name) if name in varies else getattr(mj_model, name)
+            for name in ("geom_pos", "geom_quat", "body_pos", "body_quat")
+        )
         position: list[_Vector] = [[0.0, 0.0, 0.0]]
         rotation: list[_Matrix] = [[[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]]
         for body in range(1, mj_model.nbody):
-            pos, rot = _body_pose(mj_model, body, qpos, position, rotation)
+            pos, rot = _body_pose(mj_model, body, qpos, position, rotation, body_pos, body_quat)
             position.append(pos)
             rotation.append(rot)
         geom_xpos = [
             _transform(position[body], rotation[body], _vector(offset))
-            for body, offset in zip(mj_model.geom_bodyid, mj_model.geom_pos, strict=True)
+            for body, offset in zip(mj_model.geom_bodyid, geom_pos, strict=True)
         ]
         geom_xmat = [
             _multiply(rotation[body], _constant_rotation(quat))
-            for body, quat in zip(mj_model.geom_bodyid, mj_model.geom_quat, strict=True)
+            for body, quat in zip(mj_model.geom_bodyid, geom_quat, strict=True)
         ]
         site_xpos = [
             _transform(position[body], rotation[body], _vector(offset))
@@ -90,6 +100,8 @@ def _body_pose(
     qpos: jax.Array,
     position: list[_Vector],
     rotation: list[_Matrix],
+    body_pos: jax.Array | np.ndarray,
+    body_quat: jax.Array | np.ndarray,
 ) -> tuple[_Vector, _Matrix]:
     parent = model.body_parentid[body]
     first = model.body_jntadr[body]
@@ -97,8 +109,8 @@ def _body_pose(
     if len(joints) and model.jnt_type[first] == _FREE:
         start = model.jnt_qposadr[first]
         return list(qpos[start : start + 3]), _quat_to_mat(qpos[start + 3 : start + 7])
-    pos = _transform(position[parent], rotation[parent], _vector(model.body_pos[body]))
-    rot = _multiply(rotation[parent], _constant_rotation(model.body_quat[body]))
+    pos = _transform(position[parent], rotation[parent], _vector(body_pos[body]))
+    rot = _multiply(rotation[parent], _constant_rotation(body_quat[body]))
     for joint in joints:
         address = model.jnt_qposadr[joint]
         value = qpos[address] - float(model.qpos0[address])
@@ -176,14 +188,18 @@ def _quat_to_mat(quat: jax.Array) -> _Matrix:
     ]
 
 
-def _constant_rotation(quat: np.ndarray) -> _Matrix:
+def _constant_rotation(quat: np.ndarray | jax.Array) -> _Matrix:
+    if isinstance(quat, jax.Array):
+        return _quat_to_mat(quat)
     mat = np.empty(9)
     mujoco.mju_quat2Mat(mat, quat)
     # Rounded, or the last bits of a converted Euler angle would hide an exact 0 or 1.
     return [_vector(row) for row in mat.reshape(3, 3).round(12)]
 
 
-def _vector(values: np.ndarray) -> _Vector:
+def _vector(values: np.ndarray | jax.Array) -> _Vector:
+    if isinstance(values, jax.Array):
+        return list(values)
     return [float(x) for x in values]
 
 

@@ -59,8 +59,10 @@ class Lab:
 @functools.cache
 def make_lab(backend: str) -> Lab:
     scene = load_scene("arm_cube")
-    physics = make_physics(scene, backend)
     ids = resolve_task(scene)
+    physics = make_physics(
+        scene.mj_model, backend, substeps=ids.substeps, mjx_iterations=tuple(ids.mjx_iterations)
+    )
     qpos = jnp.asarray(np.tile(ids.home_qpos, (NUM_ENVS, 1)))
     ctrl = jnp.asarray(np.tile(ids.home_ctrl, (NUM_ENVS, 1)))
     init = jax.jit(jax.vmap(physics.init))

@@ -115,12 +115,12 @@ def test_nested_vmap_gives_the_same_as_flat(labs, backend):
 
 def test_auto_is_native_on_cpu(scene):
     expected = "native" if jax.default_backend() == "cpu" else "mjx"
-    assert make_physics(scene, "auto").backend == expected
+    assert make_physics(scene.mj_model, substeps=2).backend == expected
 
 
 def test_unknown_backend_is_refused(scene):
     with pytest.raises(ValueError, match="unknown physics 'bullet': give one of auto, mjx"):
-        make_physics(scene, "bullet")
+        make_physics(scene.mj_model, "bullet", substeps=2)
 
 
 def test_only_mjx_on_cpu_is_compiled_in_its_own_way(labs):

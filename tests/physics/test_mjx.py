@@ -27,7 +27,8 @@ from mjx_arm.scene import load_scene, resolve_task
 
 envs = 256 * jax.device_count()
 scene = load_scene("arm_cube")
-ids, physics = resolve_task(scene), make_physics(scene, "mjx")
+ids = resolve_task(scene)
+physics = make_physics(scene.mj_model, "mjx", substeps=2, mjx_iterations=(5, 8))
 qpos = jnp.asarray(np.tile(ids.home_qpos, (envs, 1)))
 ctrl = jnp.asarray(np.tile(ids.home_ctrl, (envs, 1)))
 
@@ -74,7 +75,7 @@ def test_a_program_that_may_hang_is_refused(scene, on_two_threads):
 def test_as_many_devices_as_threads_are_refused(scene, on_two_threads, monkeypatch):
     monkeypatch.setattr(jax, "local_device_count", lambda: 2)
     with pytest.raises(ValueError, match="2 threads and 2 matrix factorisations at once"):
-        make_physics(scene, "mjx")
+        make_physics(scene.mj_model, "mjx", substeps=2, mjx_iterations=(5, 8))
 
 
 @pytest.mark.parametrize(("integrator", "threads"), [("IMPLICITFAST", "3"), ("EULER", "2")])
@@ -95,7 +96,7 @@ def test_importing_mjx_prints_nothing():
 
 def test_products_keep_all_bits(scene, ids):
     """On a GPU jax would else take 10 bits of what is multiplied."""
-    physics = make_physics(scene, "mjx")
+    physics = make_physics(scene.mj_model, "mjx", substeps=2, mjx_iterations=(5, 8))
     state = physics.init(jnp.asarray(ids.home_qpos), jnp.asarray(ids.home_ctrl))
     program = jax.jit(physics.step).lower(state, jnp.asarray(ids.home_ctrl)).as_text()
     products = [line for line in program.splitlines() if "dot_general" in line]
@@ -113,7 +114,8 @@ def test_the_scene_says_how_often_mjx_iterates(scene, ids, tmp_path):
         path = tmp_path / "scene.xml"
         path.write_text(text.replace(numeric, other))
         other_scene = load_scene(path)
-        physics = make_physics(other_scene, "mjx")
+        iterations = tuple(resolve_task(other_scene).mjx_iterations)
+        physics = make_physics(other_scene.mj_model, "mjx", substeps=2, mjx_iterations=iterations)
         state = physics.init(jnp.asarray(ids.home_qpos), jnp.asarray(ids.home_ctrl))
         program = jax.jit(physics.step).lower(state, jnp.asarray(ids.home_ctrl)).as_text()
         loops[name] = program.count("stablehlo.while")
@@ -125,10 +127,73 @@ def test_the_scene_says_how_often_mjx_iterates(scene, ids, tmp_path):
         resolve_task(load_scene(path))
 
 
+def test_the_iterations_default_to_the_options_of_the_model(scene, ids):
+    programs = []
+    for iterations in (None, (10, 20)):
+        physics = make_physics(scene.mj_model, "mjx", substeps=1, mjx_iterations=iterations)
+        state = physics.init(jnp.asarray(ids.home_qpos), jnp.asarray(ids.home_ctrl))
+        lowered = jax.jit(physics.step).lower(state, jnp.asarray(ids.home_ctrl))
+        programs.append(lowered.as_text())
+    assert (scene.mj_model.opt.iterations, scene.mj_model.opt.ls_iterations) == (10, 20)
+    assert programs[0] == programs[1]
+
+
+@pytest.mark.parametrize("iterations", [(5,), (5, 0), (5.5, 8), (True, 8)])
+def test_iterations_that_are_no_counts_are_refused(scene, iterations):
+    with pytest.raises(ValueError, match="mjx_iterations must be"):
+        make_physics(scene.mj_model, "mjx", substeps=2, mjx_iterations=iterations)
+
+
+def model_with(option: str = "", geom: str = "", servo: str = "", body: str = "") -> mujoco.MjModel:
+    return mujoco.MjModel.from_xml_string(f"""
+        <mujoco>
+          <option {option}><flag eulerdamp="disable"/></option>
+          <worldbody>
+            <geom name="wall" type="box" size="1 1 1" pos="0 0 -3"/>
+            <body>
+              <joint name="j" type="slide" axis="0 0 1"/>
+              <geom size="0.1 0.1 0.1" {geom}/>
+              {body}
+            </body>
+          </worldbody>
+          <actuator><position joint="j" kp="10" {servo}/></actuator>
+        </mujoco>
+    """)
+
+
+@pytest.mark.parametrize(
+    ("parts", "named"),
+    [
+        ({"option": 'integrator="implicit"'}, "integrator implicit"),
+        ({"option": 'solver="PGS"'}, "solver pgs"),
+        ({"option": 'noslip_iterations="3"'}, "noslip_iterations"),
+        ({"geom": 'type="cylinder"'}, r"\(geom cylinder, geom box\) collisions"),
+        ({"geom": 'surfacevel="1 0 0 0 0 0"'}, "geom_surfacevel"),
+        ({"geom": 'adhesion="2"'}, "geom_adhesion"),
+        ({"servo": 'armature="3"'}, "actuator_armature"),
+        ({"servo": 'damping="3"'}, "actuator_damping"),
+        ({"option": 'cone="elliptic"', "geom": 'condim="1"'}, "condim=1 with ConeType.ELLIPTIC"),
+    ],
+)
+def test_what_mjx_does_not_implement_is_named(parts, named):
+    model = model_with(**parts)
+    if "condim" in parts.get("geom", ""):
+        model.geom_condim[:] = 1
+    message = f"^physics 'mjx' does not implement {named}: change the model, or give physics='na"
+    with pytest.raises(ValueError, match=message) as caught:
+        make_physics(model, "mjx", substeps=1)
+    assert "\n" not in str(caught.value)
+    assert make_physics(model, "native", substeps=1).backend == "native"
+
+
+def test_the_model_without_these_parts_is_not_refused():
+    assert make_physics(model_with(), "mjx", substeps=1).backend == "mjx"
+
+
 @pytest.mark.skipif(not WITHOUT_WARP, reason="the extra 'warp' is installed")
 def test_mjx_warp_without_its_extra_is_refused(scene):
     with pytest.raises(ValueError, match=r"needs the extra 'warp': pip install 'mjx-arm\[warp\]'"):
-        make_physics(scene, "mjx-warp")
+        make_physics(scene.mj_model, "mjx-warp", substeps=2)
 
 
 @pytest.mark.skipif(WITHOUT_WARP, reason="needs the extra 'warp': pip install 'mjx-arm[warp]'")
@@ -138,7 +203,7 @@ def test_mjx_warp_goes_where_native_goes(scene, ids):
     ctrl[:, ids.arm_ctrl] += np.float32(0.1)
     ends = []
     for backend in ("native", "mjx-warp"):
-        physics = make_physics(scene, backend)
+        physics = make_physics(scene.mj_model, backend, substeps=2)
         start = jax.vmap(physics.init)(qpos, jnp.asarray(ctrl))
         ends.append(scan_of(physics)(start, jnp.asarray(np.tile(ctrl, (20, 1, 1))))[0])
     native, warp = ends

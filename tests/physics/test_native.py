@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 from physics_lab import HOLDING, NUM_ENVS, grasp_starts, make_lab, scan_of
 
-from mjx_arm.physics import native
+from mjx_arm.physics import make_physics, native
+from mjx_arm.physics.base import check_model
 from mjx_arm.physics.native import BatchPool, make_native
 
 _CARRIED = (
@@ -148,7 +149,7 @@ TWO_DEVICES = """
 
     assert jax.device_count() == 2
     scene = load_scene("arm_cube")
-    ids, physics = resolve_task(scene), make_physics(scene, "native")
+    ids, physics = resolve_task(scene), make_physics(scene.mj_model, "native", substeps=2)
     qpos = np.tile(ids.home_qpos, (8, 1))
     ctrl = np.tile(ids.home_ctrl, (8, 1))
     ctrl[:, ids.arm_ctrl] += np.linspace(-0.3, 0.3, 8, dtype=np.float32)[:, None]
@@ -202,15 +203,102 @@ def test_mujoco_may_log_again_afterwards(lab):
     assert (after.logto_file, after.logto_console) == (before.logto_file, before.logto_console)
 
 
-def test_state_that_is_not_carried_is_refused():
-    model = mujoco.MjModel.from_xml_string("""
-        <mujoco>
-          <worldbody><body><joint name="j"/><geom size="1"/></body></worldbody>
-          <actuator><general joint="j" dyntype="filter" dynprm="1"/></actuator>
-        </mujoco>
-    """)
-    with pytest.raises(ValueError, match="supports no activations"):
-        make_native(model, 1)
+MOCAP = '<body mocap="true"><geom size="1"/></body>'
+DELAY = '<position joint="j" kp="1" delay="0.02" nsample="3"/>'
+STATEFUL = """
+<mujoco>
+  {head}
+  <worldbody><body><joint name="j"/><geom size="1"/></body>{world}</worldbody>
+  <actuator>{servo}</actuator>
+</mujoco>
+"""
+
+
+@pytest.mark.parametrize("backend", ["native", "mjx"])
+@pytest.mark.parametrize(
+    ("parts", "named"),
+    [
+        ({"world": MOCAP}, "mocap bodies"),
+        ({"servo": DELAY}, "delays of actuators or sensors"),
+        ({"head": '<option><flag sleep="enable"/></option>'}, "the flags 'sleep' or 'ipc'"),
+        ({"head": '<size nuserdata="3"/>'}, "user data"),
+    ],
+)
+def test_state_that_is_not_carried_is_refused(backend, parts, named):
+    text = STATEFUL.format(**{"head": "", "world": "", "servo": "", **parts})
+    with pytest.raises(ValueError, match=f"physics supports no {named}.*: remove them from"):
+        make_physics(mujoco.MjModel.from_xml_string(text), backend, substeps=1)
+
+
+def test_plugins_are_refused(scene):
+    class WithPlugin:
+        nplugin = 1
+        nmocap = nhistory = nuserdata = 0
+        opt = scene.mj_model.opt
+
+    with pytest.raises(ValueError, match="physics supports no plugins"):
+        check_model(WithPlugin)
+
+
+def test_a_model_that_no_batch_can_run_is_refused(scene, monkeypatch):
+    def fail(*args, **kwargs):
+        raise ValueError("no batch\nfor this")
+
+    monkeypatch.setattr(native.mj_batch, "Batch", fail)
+    with pytest.raises(ValueError, match=r"^physics 'native' cannot run this model: no batch for"):
+        make_physics(scene.mj_model, "native", substeps=1)
+
+
+@pytest.mark.parametrize("substeps", [2.9, 2.0, 0, -1, True, "2", None, np.nan])
+@pytest.mark.parametrize("backend", ["native", "mjx"])
+def test_substeps_that_are_no_count_are_refused(scene, backend, substeps):
+    with pytest.raises(ValueError, match="substeps must be a whole number of at least 1, got"):
+        make_physics(scene.mj_model, backend, substeps=substeps)
+
+
+def test_a_count_of_numpy_is_a_count(scene):
+    physics = make_physics(scene.mj_model, "native", substeps=np.int64(2))
+    assert type(physics.substeps) is int
+
+
+def test_without_jit_the_steps_are_the_same(lab):
+    qpos, ctrl = lab.home()
+    expected = lab.run(lab.init(qpos, ctrl), ctrl, 2)
+    with jax.disable_jit():
+        state = jax.vmap(lab.physics.init)(jnp.asarray(qpos), jnp.asarray(ctrl))
+        for _ in range(2):
+            state = jax.vmap(lab.physics.step)(state, jnp.asarray(ctrl))
+    np.testing.assert_array_equal(state.integration, expected.integration)
+
+
+WITHOUT_JIT = """
+    import threading
+    import jax, jax.numpy as jnp
+    from mjx_arm.physics import make_physics
+    from mjx_arm.scene import load_scene, resolve_task
+
+    scene = load_scene("arm_cube")
+    ids = resolve_task(scene)
+
+    def work():
+        physics = make_physics(scene.mj_model, "native", substeps=2)
+        state = physics.init(jnp.asarray(ids.home_qpos), jnp.asarray(ids.home_ctrl))
+        state = physics.step(state, jnp.asarray(ids.home_ctrl))
+        print(bool(state.diverged), jax.config.jax_disable_jit)
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    thread.join()
+"""
+
+
+def test_the_first_use_may_be_without_jit_and_in_a_thread(monkeypatch):
+    monkeypatch.setenv("JAX_DISABLE_JIT", "1")
+    code = textwrap.dedent(WITHOUT_JIT)
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=300, check=False
+    )
+    assert done.stdout.strip() == "False True", done.stderr
 
 
 def test_poses_are_there_from_the_first_call(scene, ids):
