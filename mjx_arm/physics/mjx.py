@@ -236,12 +236,18 @@ def _derive(mj_model: mujoco.MjModel, model: Any, template: Any) -> Any:
     translation, rotation = (
         jnp.mean(jax.vmap(weight)(jnp.swapaxes(x, -1, -2)), axis=-1) for x in jacobians
     )
-    moves = np.asarray(mj_model.body_weldid) != 0
     pairs = jnp.stack([translation, rotation], axis=-1)
+    pairs = jnp.where(np.asarray(mj_model.body_weldid)[:, None] != 0, pairs, 0.0)
+    # MuJoCo takes a short cut where a body only slides: 1 / mass, whatever the armature.
+    slides = np.asarray(mj_model.body_simple) == 2
+    by_mass = 1 / jnp.where(slides, model.body_mass, 1.0)
+    pairs = jnp.where(slides[:, None], by_mass[:, None] * np.asarray([1.0, 0.0], np.float32), pairs)
+    dofs = np.asarray(mj_model.dof_bodyid)
+    joints = _joint_means(mj_model, jnp.diagonal(inverse))
     moment = data._impl.actuator_moment
     return model.replace(
-        body_invweight0=jnp.where(moves[:, None], pairs, 0.0),
-        dof_invweight0=_joint_means(mj_model, jnp.diagonal(inverse)),
+        body_invweight0=pairs,
+        dof_invweight0=jnp.where(slides[dofs], by_mass[dofs], joints),
         tendon_invweight0=weight(data._impl.ten_J),
         tendon_length0=data.ten_length,
         actuator_acc0=jnp.linalg.norm(moment @ inverse, axis=-1),
