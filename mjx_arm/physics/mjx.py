@@ -172,7 +172,6 @@ def make_mjx(
 
     def advance(state: PhysicsState, ctrl: jax.Array, params: Params) -> Any:
         fields = {field: fill(mj_model, varies, params, field) for field in varies}
-        # `fill` without params must leave the program as it was.
         varied = model.replace(**fields) if fields else model
         if mj_model.nv and DERIVING_FIELDS.intersection(fields):
             varied = _derive(mj_model, varied, template)
@@ -180,9 +179,10 @@ def make_mjx(
             qpos=state.qpos,
             qvel=state.qvel,
             ctrl=ctrl,
-            qacc_warmstart=state.integration[:nv],
-            act=state.integration[nv:] if mj_model.na else template.act,
+            qacc_warmstart=state.integration[:nv] if mj_model.na else state.integration,
         )
+        if mj_model.na:
+            data = data.replace(act=state.integration[nv:])
         return jax.lax.fori_loop(0, substeps, lambda _, d: mjx.step(varied, d), data)
 
     def step(state: PhysicsState, ctrl: jax.Array, params: Params = NO_PARAMS) -> PhysicsState:
@@ -191,8 +191,10 @@ def make_mjx(
         # the precision of its products to jax, which would use TF32 on a GPU.
         with jax.numpy_dtype_promotion("standard"), jax.default_matmul_precision("highest"):
             data = advance(state, ctrl, params)
-        carried = [data.qacc_warmstart, data.act] if mj_model.na else [data.qacc_warmstart]
-        after = (data.qpos, data.qvel, jnp.concatenate(carried))
+        integration = data.qacc_warmstart
+        if mj_model.na:
+            integration = jnp.concatenate([integration, data.act])
+        after = (data.qpos, data.qvel, integration)
         sane = [jnp.all(jnp.abs(x) < _MAX_VALUE) for x in after]
         diverged = ~(sane[0] & sane[1] & sane[2])
         before = (state.qpos, state.qvel, state.integration)

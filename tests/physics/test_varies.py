@@ -19,9 +19,12 @@ from mjx_arm.physics import native as native_backend
 from mjx_arm.physics.base import DERIVING_FIELDS
 from mjx_arm.varies import own_params
 
-# After an iteration that closes the gripper around a cube, from 100 random params.
-MOST_ANGLE_DIFFERENCE = 1e-3
-MOST_PLACE_DIFFERENCE = 5e-4
+# After 5 iterations that close the gripper around a cube, with 100 random params: rad and m. MJX
+# leaves MuJoCo's way in a few grasps, also where the model was edited instead.
+MOST_ANGLE_DIFFERENCE = 2e-5
+MOST_PLACE_DIFFERENCE = 1e-4
+MOST_OUTLIERS = 4
+MOST_DIFFERENCE_OF_EDITED = 5e-5
 CONSTANT_TOLERANCE = 2e-5
 
 CHAIN = """
@@ -125,7 +128,9 @@ def plain_loop(model: mujoco.MjModel, qpos, ctrl, steps: int) -> mujoco.MjData:
     return data
 
 
-def grasping(ids, model: mujoco.MjModel, count: int, lifted: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+def grasping(
+    ids, model: mujoco.MjModel, count: int, lifted: float = 0.0
+) -> tuple[np.ndarray, np.ndarray]:
     """Grippers that shut around a cube, on the table or in the air, while the arm turns a little.
 
     Returns `qpos [count, nq]` and `ctrl [count, nu]`.
@@ -302,15 +307,35 @@ class TestMjx:
             ends[backend] = run(physics, qpos, ctrl, params, 5)
             assert not ends[backend].diverged.any()
         angles, places = difference(ids, ends["native"], ends["mjx"])
-        print(np.sort(angles)[[50,90,95,-3,-2,-1]], np.sort(places)[[50,90,95,-3,-2,-1]])
-        assert angles.max() < MOST_ANGLE_DIFFERENCE
-        assert places.max() < MOST_PLACE_DIFFERENCE
-        # Without the params the backends would not agree: they matter.
+        assert np.sum(angles > MOST_ANGLE_DIFFERENCE) <= MOST_OUTLIERS
+        assert np.sum(places > MOST_PLACE_DIFFERENCE) <= MOST_OUTLIERS
+        # Params that are not given to one backend make a difference that the test sees.
         plain = make_physics(model, "native", substeps=2)
         angles, places = difference(ids, run(plain, qpos, ctrl, {}, 5), ends["mjx"])
-        print(np.sort(angles)[[10,50,90]], np.sort(places)[[10,50,90]])
-        assert np.median(angles) > 2 * MOST_ANGLE_DIFFERENCE
-        assert np.median(places) > MOST_PLACE_DIFFERENCE
+        assert np.median(angles) > MOST_ANGLE_DIFFERENCE
+        assert np.sum(places > MOST_PLACE_DIFFERENCE) > 50
+
+    @pytest.mark.slow
+    def test_it_is_mjx_of_the_edited_model(self, scene, ids):
+        model, varies = scene.mj_model, arm_varies(scene.mj_model)
+        qpos, ctrl = grasping(ids, model, 20, lifted=0.3)
+        params = random_params(model, varies, 20, seed=5)
+        physics = make_physics(model, "mjx", substeps=2, varies=varies)
+        varied = run(physics, qpos, ctrl, params, 5)
+        _, template = mjx_backend._put(model, "jax")
+        models = [mjx_backend._put(edited(model, varies, params, i), "jax")[0] for i in range(20)]
+        leaves = [jnp.stack(x) for x in zip(*map(jax.tree.leaves, models), strict=True)]
+        stacked = jax.tree.unflatten(jax.tree.structure(models[0]), leaves)
+
+        def ten_steps(mjx_model, qpos, ctrl):
+            data = template.replace(qpos=qpos, ctrl=ctrl)
+            with jax.numpy_dtype_promotion("standard"), jax.default_matmul_precision("highest"):
+                step = functools.partial(mjx_backend.mjx.step, mjx_model)
+                return jax.lax.fori_loop(0, 10, lambda _, data: step(data), data).qpos
+
+        options = compiler_options(physics)
+        right = jax.jit(jax.vmap(ten_steps), compiler_options=options)(stacked, qpos, ctrl)
+        np.testing.assert_allclose(varied.qpos, right, atol=MOST_DIFFERENCE_OF_EDITED)
 
 
 def difference(ids, one, other) -> tuple[np.ndarray, np.ndarray]:
