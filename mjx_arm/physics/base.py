@@ -128,7 +128,7 @@ class Physics:
     substeps: int
     timestep: float
     host_memory: Callable[[int], int] = lambda simulations: 0
-    varies: Varies = dataclasses.field(default_factory=dict)
+    varies: Varies = dataclasses.field(default_factory=dict, hash=False)
 
 
 def whole_number(name: str, value: object) -> int:

@@ -172,7 +172,6 @@ def make_mjx(
 
     def advance(state: PhysicsState, ctrl: jax.Array, params: Params) -> Any:
         fields = {field: fill(mj_model, varies, params, field) for field in varies}
-        # `fill` without params must leave the program as it was.
         varied = model.replace(**fields) if fields else model
         if mj_model.nv and DERIVING_FIELDS.intersection(fields):
             varied = _derive(mj_model, varied, template)
@@ -180,9 +179,10 @@ def make_mjx(
             qpos=state.qpos,
             qvel=state.qvel,
             ctrl=ctrl,
-            qacc_warmstart=state.integration[:nv],
-            act=state.integration[nv:] if mj_model.na else template.act,
+            qacc_warmstart=state.integration[:nv] if mj_model.na else state.integration,
         )
+        if mj_model.na:
+            data = data.replace(act=state.integration[nv:])
         return jax.lax.fori_loop(0, substeps, lambda _, d: mjx.step(varied, d), data)
 
     def step(state: PhysicsState, ctrl: jax.Array, params: Params = NO_PARAMS) -> PhysicsState:
@@ -191,8 +191,10 @@ def make_mjx(
         # the precision of its products to jax, which would use TF32 on a GPU.
         with jax.numpy_dtype_promotion("standard"), jax.default_matmul_precision("highest"):
             data = advance(state, ctrl, params)
-        carried = [data.qacc_warmstart, data.act] if mj_model.na else [data.qacc_warmstart]
-        after = (data.qpos, data.qvel, jnp.concatenate(carried))
+        integration = data.qacc_warmstart
+        if mj_model.na:
+            integration = jnp.concatenate([integration, data.act])
+        after = (data.qpos, data.qvel, integration)
         sane = [jnp.all(jnp.abs(x) < _MAX_VALUE) for x in after]
         diverged = ~(sane[0] & sane[1] & sane[2])
         before = (state.qpos, state.qvel, state.integration)
@@ -236,12 +238,18 @@ def _derive(mj_model: mujoco.MjModel, model: Any, template: Any) -> Any:
     translation, rotation = (
         jnp.mean(jax.vmap(weight)(jnp.swapaxes(x, -1, -2)), axis=-1) for x in jacobians
     )
-    moves = np.asarray(mj_model.body_weldid) != 0
     pairs = jnp.stack([translation, rotation], axis=-1)
+    pairs = jnp.where(np.asarray(mj_model.body_weldid)[:, None] != 0, pairs, 0.0)
+    # MuJoCo takes a short cut where a body only slides: 1 / mass, whatever the armature.
+    slides = np.asarray(mj_model.body_simple) == 2
+    by_mass = 1 / jnp.where(slides, model.body_mass, 1.0)
+    pairs = jnp.where(slides[:, None], by_mass[:, None] * np.asarray([1.0, 0.0], np.float32), pairs)
+    dofs = np.asarray(mj_model.dof_bodyid)
+    joints = _joint_means(mj_model, jnp.diagonal(inverse))
     moment = data._impl.actuator_moment
     return model.replace(
-        body_invweight0=jnp.where(moves[:, None], pairs, 0.0),
-        dof_invweight0=_joint_means(mj_model, jnp.diagonal(inverse)),
+        body_invweight0=pairs,
+        dof_invweight0=jnp.where(slides[dofs], by_mass[dofs], joints),
         tendon_invweight0=weight(data._impl.ten_J),
         tendon_length0=data.ten_length,
         actuator_acc0=jnp.linalg.norm(moment @ inverse, axis=-1),
