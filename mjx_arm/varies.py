@@ -1,0 +1,154 @@
+"""What varies by episode: some rows of some arrays of an MjModel.
+
+Environment, physics, kinematics and renderer are made with the same `Varies`, which is static. Each
+episode then has its own `Params`, which are traced. A part of the library reads the fields that it
+knows from `Params`, and all other numbers from the model.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Mapping
+from typing import TypeAlias
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+Varies: TypeAlias = Mapping[str, tuple[int, ...]]
+"""Name of a float array of MjModel, or of the headlight -> the ids of its rows that vary."""
+
+Params: TypeAlias = dict[str, jax.Array]
+"""The same names -> the values of those rows, `[len(ids), ...] float32`, in the order of the ids."""
+
+# The headlight has no row in an array of MjModel. Each of its colours is an array of one row here.
+_HEADLIGHT = {"headlight_ambient": "ambient", "headlight_diffuse": "diffuse"}
+
+
+def check_varies(mj_model: mujoco.MjModel, varies: Varies | None) -> None:
+    """Checks that every name and row exists.
+
+    Besides the float arrays of MjModel the names may be `headlight_ambient` and
+    `headlight_diffuse`. These are the colours of `mj_model.vis.headlight`; their only row is 0.
+
+    Raises:
+      ValueError: a name is not a float array of MjModel, or its rows are not distinct ids of it.
+    """
+    for field, ids in (varies or {}).items():
+        count = len(_values(mj_model, field))
+        wrong = [row for row in ids if not _is_row(row, count)]
+        if wrong:
+            raise ValueError(
+                f"varies[{field!r}] has the row {wrong[0]!r}; allowed are the integers from 0 to "
+                f"{count - 1}, the rows of this field in the model"
+            )
+        if len(set(ids)) != len(ids):
+            raise ValueError(f"varies[{field!r}] = {tuple(ids)} must name each row once")
+
+
+def check_params(mj_model: mujoco.MjModel, varies: Varies | None, params: Params | None) -> None:
+    """Checks that `params` has the fields and shapes that `varies` announces.
+
+    Raises:
+      ValueError: a field is missing, was not announced, or has another shape.
+    """
+    varies, params = varies or {}, params or {}
+    for field, ids in varies.items():
+        if field not in params:
+            raise ValueError(f"params lacks {field!r}, which varies; it has {sorted(params)}")
+        expected = (len(ids), *_values(mj_model, field).shape[1:])
+        if jnp.shape(params[field]) != expected:
+            raise ValueError(
+                f"params[{field!r}] has the shape {list(jnp.shape(params[field]))}; it must be "
+                f"{list(expected)}, the rows of one episode (use jax.vmap for several)"
+            )
+    for field in params:
+        if field not in varies:
+            raise ValueError(
+                f"params has {field!r}, which does not vary; name its rows in `varies` as well"
+            )
+
+
+def rows(mj_model: mujoco.MjModel, field: str) -> np.ndarray:
+    """Returns the model's own values of a field, `[n, ...] float32`.
+
+    Raises:
+      ValueError: the field is not a float array of MjModel.
+    """
+    return np.array(_values(mj_model, field), np.float32)
+
+
+def fill(
+    mj_model: mujoco.MjModel, varies: Varies | None, params: Params | None, field: str
+) -> jax.Array | np.ndarray:
+    """Returns a whole field: the model's values, with the varying rows taken from `params`.
+
+    Args:
+      mj_model: the model.
+      varies: which rows vary.
+      params: their values. Other fields in it are ignored.
+      field: name of the field.
+
+    Returns:
+      `[n, ...] float32`. A constant numpy array if no row of the field varies.
+
+    Raises:
+      ValueError: the field is unknown, or varies and is missing in `params`.
+    """
+    own = rows(mj_model, field)
+    ids = tuple((varies or {}).get(field, ()))
+    if not ids:
+        return own
+    if field not in (params or {}):
+        raise ValueError(f"params lacks {field!r}, which varies; it has {sorted(params or {})}")
+    return replace_rows(own, ids, (params or {})[field])
+
+
+def replace_rows(array: np.ndarray, ids: tuple[int, ...], values: jax.Array) -> jax.Array:
+    """Returns `array [n, ...]` with the rows `ids` replaced by `values [len(ids), ...]`, float32.
+
+    This is a concatenation of slices, because XLA on CPU runs a scatter as a loop.
+    """
+    values = jnp.asarray(values, jnp.float32)
+    place = {row: k for k, row in enumerate(ids)}
+    pieces: list[jax.Array] = []
+    row = 0
+    while row < len(array):
+        end = row + 1
+        if row in place:
+            while place.get(end) == place[row] + end - row:
+                end += 1
+            pieces.append(values[place[row] : place[row] + end - row])
+        else:
+            while end < len(array) and end not in place:
+                end += 1
+            pieces.append(jnp.asarray(array[row:end], jnp.float32))
+        row = end
+    return jnp.concatenate(pieces) if len(pieces) > 1 else pieces[0]
+
+
+def _values(mj_model: mujoco.MjModel, field: str) -> np.ndarray:
+    if field in _HEADLIGHT:
+        return np.asarray(getattr(mj_model.vis.headlight, _HEADLIGHT[field]))[None]
+    values = getattr(mj_model, field, None) if isinstance(field, str) else None
+    if not isinstance(values, np.ndarray) or not np.issubdtype(values.dtype, np.floating):
+        near = difflib.get_close_matches(str(field), _float_fields(mj_model), n=1)
+        hint = f"; did you mean {near[0]!r}?" if near else ""
+        raise ValueError(f"{field!r} is not a float array of MjModel{hint}")
+    return values
+
+
+def _float_fields(mj_model: mujoco.MjModel) -> list[str]:
+    found = [
+        name
+        for name in dir(mj_model)
+        if isinstance(values := getattr(mj_model, name, None), np.ndarray)
+        and np.issubdtype(values.dtype, np.floating)
+    ]
+    return [*found, *_HEADLIGHT]
+
+
+def _is_row(row: object, count: int) -> bool:
+    whole = isinstance(row, int | np.integer) and not isinstance(row, bool)
+    return whole and 0 <= int(row) < count  # type: ignore[call-overload]
