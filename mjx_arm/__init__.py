@@ -5,13 +5,12 @@ from mjx_arm.auto_reset import AutoReset
 from mjx_arm.config import PRESETS, EnvConfig, RewardConfig, TrainConfig
 from mjx_arm.env import Env, EnvState, make
 from mjx_arm.loop import make_train
-from mjx_arm.render import Appearance, default_appearance, make_renderer, rgb, segmentation
+from mjx_arm.render import make_renderer, rgb, segmentation
 from mjx_arm.scene import Scene, load_scene
 
 __all__ = [
     "PRESETS",
     "Agent",
-    "Appearance",
     "AutoReset",
     "Env",
     "EnvConfig",
@@ -19,7 +18,6 @@ __all__ = [
     "RewardConfig",
     "Scene",
     "TrainConfig",
-    "default_appearance",
     "load_agent",
     "load_scene",
     "make",

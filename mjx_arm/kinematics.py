@@ -79,7 +79,7 @@ def make_kinematics(mj_model: mujoco.MjModel, varies: Varies | None = None) -> K
         row or a field of joints or sites that cannot vary. The returned function raises it
         for `params` that do not fit `varies`.
     """
-    _check_joints(mj_model)
+    _check_bodies(mj_model, range(mj_model.nbody))
     _check_varies(mj_model, varies)
 
     def kinematics(qpos: jax.Array, params: Params | None = None) -> Poses:
@@ -111,7 +111,8 @@ def make_camera_pose(
     The renderer of a camera on a moving body takes the result as its `camera_pose`.
 
     Args:
-      mj_model: a model with free, hinge and slide joints, and without mocap bodies.
+      mj_model: the model. From the world to the camera's body it has free, hinge and slide joints
+        only, and no mocap body.
       camera: name of a camera of mode `fixed`: one that moves with its body.
       varies: which rows of the model vary by episode. Of these the function reads `cam_pos`,
         `cam_quat`, `body_pos` and `body_quat` from its `params`.
@@ -123,14 +124,12 @@ def make_camera_pose(
     Raises:
       ValueError: the camera is unknown or of another mode, or as `make_kinematics`.
     """
-    _check_joints(mj_model)
-    _check_varies(mj_model, varies)
     camera_id = find_camera(mj_model, camera)
     chain = _chain(mj_model, mj_model.cam_bodyid[camera_id])
+    _check_bodies(mj_model, chain)
+    _check_varies(mj_model, varies)
 
-    def camera_pose(
-        qpos: jax.Array, params: Params | None = None
-    ) -> tuple[jax.Array, jax.Array]:
+    def camera_pose(qpos: jax.Array, params: Params | None = None) -> tuple[jax.Array, jax.Array]:
         check_params(mj_model, varies, params)
         read = _make_read(mj_model, varies, params)
         frame = _body_frames(mj_model, chain, qpos, read)[chain[-1]]
@@ -158,14 +157,14 @@ def find_camera(mj_model: mujoco.MjModel, camera: str) -> int:
     return camera_id
 
 
-def _check_joints(mj_model: mujoco.MjModel) -> None:
-    for joint in range(mj_model.njnt):
+def _check_bodies(mj_model: mujoco.MjModel, bodies: Sequence[int]) -> None:
+    for joint in np.flatnonzero(np.isin(mj_model.jnt_bodyid, bodies)).tolist():
         if mj_model.jnt_type[joint] not in (_FREE, _HINGE, _SLIDE):
             raise ValueError(
                 f"joint {mj_model.joint(joint).name!r} is a ball joint; "
                 "supported are free, hinge and slide joints"
             )
-    if mj_model.nmocap:
+    if np.any(mj_model.body_mocapid[list(bodies)] >= 0):
         raise ValueError("the scene has mocap bodies, which are not supported")
 
 

@@ -1,4 +1,4 @@
-"""Which geoms of a MuJoCo model can be drawn, which are visible, and in which colour."""
+"""Which geoms of a MuJoCo model can be rendered, which are visible, and in which colour."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ import dataclasses
 
 import mujoco
 import numpy as np
+
+from mjx_arm.varies import Varies
 
 # The packed image has one byte for the geom id, and 255 means that nothing was hit.
 MAX_GEOMS = 255
@@ -21,7 +23,14 @@ SUPPORTED_TYPES = {
     int(mujoco.mjtGeom.mjGEOM_CYLINDER): "cylinder",
 }
 
-_DEFAULT_RGBA = np.asarray([0.5, 0.5, 0.5, 1.0], np.float32)
+_UNSUPPORTED = {
+    "tendon": mujoco.mjtObj.mjOBJ_TENDON,
+    "flex": mujoco.mjtObj.mjOBJ_FLEX,
+    "skin": mujoco.mjtObj.mjOBJ_SKIN,
+}
+
+# MuJoCo takes this colour for "none given".
+DEFAULT_RGBA = np.asarray([0.5, 0.5, 0.5, 1.0], np.float32)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,62 +40,107 @@ class GeomGroup:
     Attributes:
       kind: one of the names in `SUPPORTED_TYPES`.
       ids: `[n] int`.
-      sizes: `[n, 3] float32`, as `geom_size` of the model, m.
     """
 
     kind: str
     ids: np.ndarray
-    sizes: np.ndarray
 
 
-def validate_geoms(mj_model: mujoco.MjModel) -> None:
-    """Checks that every visible geom of a model can be drawn.
+def validate_geoms(mj_model: mujoco.MjModel, varies: Varies | None = None) -> None:
+    """Checks that the renderer supports whatever is visible in a model.
+
+    Sites are markers and are never rendered, so they are not checked.
+
+    Args:
+      mj_model: the model.
+      varies: rows of the model that vary by episode.
 
     Raises:
-      ValueError: a visible geom is no plane, box, sphere, capsule or cylinder, or wears a
-        texture; or there are more than 255 geoms.
+      ValueError: a visible geom is no plane, box, sphere, capsule or cylinder, or has a texture; a
+        spatial tendon, flex or skin is visible; or there are more than 255 geoms.
     """
     if mj_model.ngeom > MAX_GEOMS:
         raise ValueError(
             f"the model has {mj_model.ngeom} geoms, but a packed image has ids for {MAX_GEOMS}"
         )
     supported = ", ".join(SUPPORTED_TYPES.values())
-    for geom in np.flatnonzero(visible_geoms(mj_model)).tolist():
+    for geom in np.flatnonzero(visible_geoms(mj_model, varies)).tolist():
         geom_type = int(mj_model.geom_type[geom])
         if geom_type not in SUPPORTED_TYPES:
             kind = mujoco.mjtGeom(geom_type).name.removeprefix("mjGEOM_").lower()
             raise ValueError(
-                f"geom {_label(mj_model, geom)} is of type {kind}, which cannot be drawn; "
-                f"supported are {supported}, and geoms of group 3 or higher are not drawn"
+                f"geom {_label(mj_model, geom)} is of type {kind}, which cannot be rendered; "
+                f"supported are {supported}, and geoms of group 3 or higher are not rendered"
             )
         material = mj_model.geom_matid[geom]
         if material >= 0 and np.any(mj_model.mat_texid[material] >= 0):
             raise ValueError(
-                f"geom {_label(mj_model, geom)} wears a texture by its material "
+                f"geom {_label(mj_model, geom)} has a texture by its material "
                 f"{mj_model.material(material).name!r}; supported are plain rgba colours"
+            )
+    _validate_others(mj_model)
+
+
+def _validate_others(mj_model: mujoco.MjModel) -> None:
+    """Refuses what MuJoCo shows besides geoms and sites."""
+    for kind, number in _UNSUPPORTED.items():
+        alpha = getattr(mj_model, f"{kind}_rgba").reshape(-1, 4)[:, 3]
+        visible = (getattr(mj_model, f"{kind}_group") < VISIBLE_GROUPS) & (alpha > 0)
+        if kind == "tendon":
+            # A fixed tendon is a sum of joints and has no shape.
+            visible &= mj_model.wrap_type[mj_model.tendon_adr] != mujoco.mjtWrap.mjWRAP_JOINT
+        for i in np.flatnonzero(visible).tolist():
+            raise ValueError(
+                f"{kind} {_label(mj_model, i, number)} is visible but cannot be rendered; "
+                "supported are geoms only, and groups of 3 or higher are not rendered"
             )
 
 
 def geom_rgba(mj_model: mujoco.MjModel) -> np.ndarray:
-    """Colour of every geom as MuJoCo draws it, `[ngeom, 4] float32` in 0..1.
+    """Colour of every geom as MuJoCo renders it, `[ngeom, 4] float32` in 0..1.
 
     A geom's own rgba wins over that of its material, unless it is MuJoCo's default grey.
     """
     rgba = np.array(mj_model.geom_rgba, np.float32).reshape(-1, 4)
     material = mj_model.geom_matid
-    inherits = (material >= 0) & np.all(rgba == _DEFAULT_RGBA, axis=1)
+    inherits = (material >= 0) & np.all(rgba == DEFAULT_RGBA, axis=1)
     rgba[inherits] = mj_model.mat_rgba[material[inherits]]
     return rgba
 
 
-def visible_geoms(mj_model: mujoco.MjModel) -> np.ndarray:
-    """Whether each geom is drawn, `[ngeom] bool`: group 0, 1 or 2, and alpha above zero."""
-    return (mj_model.geom_group < VISIBLE_GROUPS) & (geom_rgba(mj_model)[:, 3] > 0)
+def visible_geoms(mj_model: mujoco.MjModel, varies: Varies | None = None) -> np.ndarray:
+    """Whether each geom is rendered, `[ngeom] bool`: group 0, 1 or 2, and alpha above zero.
+
+    Where the colour varies by episode, alpha may be above zero in some episodes, and counts so.
+    """
+    opaque = geom_rgba(mj_model)[:, 3] > 0
+    opaque[list((varies or {}).get("geom_rgba", ()))] = True
+    return (mj_model.geom_group < VISIBLE_GROUPS) & opaque
 
 
-def static_geoms(mj_model: mujoco.MjModel) -> np.ndarray:
-    """Whether each geom is welded to the world, `[ngeom] bool`; mocap bodies are not."""
-    return np.asarray(mj_model.body_weldid[mj_model.geom_bodyid] == 0)
+def static_geoms(mj_model: mujoco.MjModel, varies: Varies | None = None) -> np.ndarray:
+    """Whether each geom is the same in all frames, `[ngeom] bool`.
+
+    These are the geoms that are welded to the world, unless their pose, size or colour varies by
+    episode. Geoms of mocap bodies are not static.
+    """
+    static = np.asarray(mj_model.body_weldid[mj_model.geom_bodyid] == 0)
+    static &= ~varying_bodies(mj_model, varies)[mj_model.geom_bodyid]
+    for field in ("geom_pos", "geom_quat", "geom_size", "geom_rgba"):
+        static[list((varies or {}).get(field, ()))] = False
+    return static
+
+
+def varying_bodies(mj_model: mujoco.MjModel, varies: Varies | None) -> np.ndarray:
+    """Whether `varies` moves each body or one of its ancestors in its parent, `[nbody] bool`."""
+    varying = np.zeros(mj_model.nbody, bool)
+    for field in ("body_pos", "body_quat"):
+        varying[list((varies or {}).get(field, ()))] = True
+    # The world's own pose is never read.
+    varying[0] = False
+    for body in range(1, mj_model.nbody):
+        varying[body] |= varying[mj_model.body_parentid[body]]
+    return varying
 
 
 def geom_groups(mj_model: mujoco.MjModel, members: np.ndarray) -> list[GeomGroup]:
@@ -95,10 +149,12 @@ def geom_groups(mj_model: mujoco.MjModel, members: np.ndarray) -> list[GeomGroup
     for geom_type, kind in SUPPORTED_TYPES.items():
         ids = np.flatnonzero(members & (mj_model.geom_type == geom_type))
         if ids.size:
-            groups.append(GeomGroup(kind, ids, mj_model.geom_size[ids].astype(np.float32)))
+            groups.append(GeomGroup(kind, ids))
     return groups
 
 
-def _label(mj_model: mujoco.MjModel, geom: int) -> str:
-    name = mj_model.geom(geom).name
-    return repr(name) if name else f"with id {geom}"
+def _label(
+    mj_model: mujoco.MjModel, number: int, kind: mujoco.mjtObj = mujoco.mjtObj.mjOBJ_GEOM
+) -> str:
+    name = mujoco.mj_id2name(mj_model, kind, number)
+    return repr(name) if name else f"with id {number}"

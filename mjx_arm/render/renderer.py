@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from typing import TYPE_CHECKING, Literal, Protocol, overload
+from typing import Literal, Protocol, overload
 
 import jax
 import jax.numpy as jnp
@@ -12,12 +12,7 @@ import mujoco
 import numpy as np
 from jax.typing import ArrayLike
 
-from mjx_arm.render.appearance import (
-    Appearance,
-    default_appearance,
-    headlight_diffuse,
-    light_casts_shadow,
-)
+from mjx_arm.render.colour import ColourStage, geom_colour
 from mjx_arm.render.geoms import (
     GeomGroup,
     geom_groups,
@@ -25,238 +20,353 @@ from mjx_arm.render.geoms import (
     validate_geoms,
     visible_geoms,
 )
+from mjx_arm.render.look import (
+    LOOK_FIELDS,
+    CameraPose,
+    Look,
+    LookSpec,
+    make_look,
+    make_look_spec,
+)
 from mjx_arm.render.materialize import materialize
 from mjx_arm.render.packing import pack
 from mjx_arm.render.rays import make_rays, make_view
 from mjx_arm.render.shading import incidence, shade
-from mjx_arm.render.surface import Poses, Setting, Surface, cast, covered, empty_surface
+from mjx_arm.render.surface import (
+    GeomPoses,
+    Setting,
+    Surface,
+    cast,
+    covered,
+    empty_surface,
+)
+from mjx_arm.varies import Params, Varies, check_params, check_varies, fill, own_params
 
-if TYPE_CHECKING:
-    from mjx_arm.scene import Scene
+# Fields that would change the image, but that the renderer takes from the model only.
+_CONSTANT_FIELDS = ("mat_rgba", "cam_sensorsize", "cam_intrinsic")
+
+
+class HasModel(Protocol):
+    """Anything with a MuJoCo model, such as a `Scene`."""
+
+    @property
+    def mj_model(self) -> mujoco.MjModel:
+        """The model."""
+        ...
 
 
 class Render(Protocol):
-    """Draws packed pixels, `[H, W] uint32`; see `make_renderer`."""
+    """Renders packed pixels, `[H, W] uint32`; see `make_renderer`."""
 
     def __call__(
-        self, geom_xpos: ArrayLike, geom_xmat: ArrayLike, appearance: Appearance | None = None
+        self,
+        geom_xpos: ArrayLike,
+        geom_xmat: ArrayLike,
+        params: Params | None = None,
+        camera_pose: CameraPose | None = None,
     ) -> jax.Array:
-        """Draws one frame."""
+        """Renders one frame."""
         ...
 
 
 class RenderWithDepth(Protocol):
-    """Draws packed pixels, `[H, W] uint32`, and z-depth, `[H, W] float32` in m."""
+    """Renders packed pixels, `[H, W] uint32`, and z-depth, `[H, W] float32` in m."""
 
     def __call__(
-        self, geom_xpos: ArrayLike, geom_xmat: ArrayLike, appearance: Appearance | None = None
+        self,
+        geom_xpos: ArrayLike,
+        geom_xmat: ArrayLike,
+        params: Params | None = None,
+        camera_pose: CameraPose | None = None,
     ) -> tuple[jax.Array, jax.Array]:
-        """Draws one frame."""
+        """Renders one frame."""
         ...
 
 
 @overload
 def make_renderer(
-    scene: Scene,
+    scene: HasModel | mujoco.MjModel,
     *,
     camera: str = ...,
     size: tuple[int, int] = ...,
     shadows: bool = ...,
     depth: Literal[False] = ...,
+    varies: Varies | None = ...,
 ) -> Render: ...
 
 
 @overload
 def make_renderer(
-    scene: Scene,
+    scene: HasModel | mujoco.MjModel,
     *,
     camera: str = ...,
     size: tuple[int, int] = ...,
     shadows: bool = ...,
     depth: Literal[True],
+    varies: Varies | None = ...,
 ) -> RenderWithDepth: ...
 
 
 @overload
 def make_renderer(
-    scene: Scene,
+    scene: HasModel | mujoco.MjModel,
     *,
     camera: str = ...,
     size: tuple[int, int] = ...,
     shadows: bool = ...,
     depth: bool = ...,
+    varies: Varies | None = ...,
 ) -> Render | RenderWithDepth: ...
 
 
 def make_renderer(
-    scene: Scene,
+    scene: HasModel | mujoco.MjModel,
     *,
     camera: str = "front",
     size: tuple[int, int] = (64, 64),
     shadows: bool = False,
     depth: bool = False,
+    varies: Varies | None = None,
 ) -> Render | RenderWithDepth:
-    """Makes `render(geom_xpos, geom_xmat, appearance=None)`, which draws one frame of a scene.
+    """Makes `render(geom_xpos, geom_xmat, params={}, camera_pose=None)` for frames of a scene.
 
-    The function is jitted, and may be vmapped any number of times. It takes the poses of
-    all geoms in the order of the model: `geom_xpos [ngeom, 3]`, m, and `geom_xmat [ngeom, 3, 3]`
-    or `[ngeom, 9]`; those of geoms welded to the world are ignored, since they are known. It
-    returns packed pixels, `[H, W] uint32`: see `rgb` and `segmentation`.
+    The function is jitted, and may be vmapped any number of times. Its arguments are
 
-    Without `appearance` the camera, light and colours are the model's, and everything that is
-    welded to the world has been cast beforehand. With an `Appearance`, traced or not, everything
-    is cast anew; start from `default_appearance`.
+    - `geom_xpos [ngeom, 3]`, m, and `geom_xmat [ngeom, 3, 3]` or `[ngeom, 9]`: the poses of all
+      geoms in the order of the model. Poses of geoms that are welded to the world are ignored,
+      unless the pose, size or colour of the geom varies by episode.
+    - `params`: the values of the rows in `varies`, of one episode.
+    - `camera_pose`: position `[3]`, m, and axes in columns, `[3, 3]`, of the camera, as
+      `mjx_arm.kinematics.make_camera_pose` computes them. A camera on a moving body needs it; for
+      another camera it replaces the model's pose.
 
-    What is drawn follows MuJoCo's own renderer: geoms of group 0, 1 and 2 with alpha above zero,
-    all opaque; ambient plus one directional light, and the headlight's diffuse part where the
-    model has one; black where nothing is hit. Not drawn are specular light, emission, reflections,
-    the skybox, geoms around the camera, and planes from behind. A shadow takes away the diffuse
-    part of the directional light. There is no near or far clipping.
+    It returns packed pixels, `[H, W] uint32`: see `rgb` and `segmentation`.
+
+    What varies: of `varies` and `params` the renderer reads `geom_rgba`, `geom_size`, `light_dir`
+    (any length but zero), `light_diffuse`, `light_ambient`, `cam_pos`, `cam_quat`, `cam_fovy`, and
+    `headlight_ambient` and `headlight_diffuse`, which have the one row 0. Poses of geoms that vary
+    reach it through `geom_xpos` and `geom_xmat`.
+
+    Speed: geoms that are the same in all frames are cast once, when the renderer is made. If the
+    camera or the direction of a light varies, or `camera_pose` is given, all geoms are cast in
+    every frame.
+
+    The image follows MuJoCo's own renderer. It shows geoms of the groups 0, 1 and 2 with alpha
+    above zero, all opaque, in plain colours. Light is the sum of ambient light, any number of
+    directional lights, and the headlight; pixels that hit nothing are black. A shadow removes the
+    diffuse part of its light. Not rendered are sites, rangefinder rays, specular light, emission,
+    reflections, the skybox, geoms around the camera, and planes from behind. There is no near or
+    far clipping.
 
     Args:
-      scene: only its `mj_model` is read.
-      camera: name of a camera that is fixed to the world.
+      scene: an `MjModel`, or an object with one as `mj_model`.
+      camera: name of a perspective camera of mode `fixed`, on any body.
       size: height and width of the image, pixels.
-      shadows: whether the directional light casts hard shadows.
+      shadows: whether directional lights cast hard shadows, where the model's `castshadow` says so.
       depth: whether to return a second array: z-depth along the optical axis, `[H, W] float32`,
         m, infinite where nothing is hit.
+      varies: rows of the model that vary by episode. Fields that do not concern the image are
+        ignored.
 
     Raises:
-      ValueError: an argument does not fit, or the model holds a geom, camera or light that cannot
-        be drawn.
+      ValueError: an argument is invalid, or the model has a geom, tendon, flex, skin, camera or
+        light that cannot be rendered. The returned function raises it for poses or `params` of
+        wrong names or shapes, and if a camera on a moving body gets no `camera_pose`.
     """
     _validate_size(size)
-    validate_geoms(scene.mj_model)
+    model = scene if isinstance(scene, mujoco.MjModel) else scene.mj_model
+    _validate_varies(model, varies)
+    validate_geoms(model, varies)
+    spec = make_look_spec(model, camera, varies or {})
+    plan = _make_plan(spec, size, shadows)
     with jax.ensure_compile_time_eval():
-        own = default_appearance(scene, camera)
-        plan = _make_plan(scene.mj_model, size, shadows)
-    cast_background = jax.jit(functools.partial(_background, plan)).lower(own).compile()
-    with jax.ensure_compile_time_eval():
-        background = cast_background(own)
-    draw = _packed_and_depth if depth else _packed
-    return jax.jit(functools.partial(draw, plan, own, background))
+        own = make_look(spec, own_params(model, varies), None)
+        background = _cast_background(plan, own) if spec.view_is_constant else None
+    render = _packed_and_depth if depth else _packed
+    return jax.jit(functools.partial(render, plan, own, background))
+
+
+def _cast_background(plan: _Plan, own: Look) -> Surface:
+    compiled = jax.jit(functools.partial(_background, plan)).lower(own).compile()
+    return compiled(own)
 
 
 @dataclasses.dataclass(frozen=True)
 class _Plan:
-    """What is settled when a renderer is made.
+    """What is known when a renderer is made.
 
     Attributes:
+      spec: camera, lights, model and what varies.
       size: height and width, pixels.
-      ngeom: number of geoms in the model.
-      still: visible geoms that are welded to the world.
-      still_poses: poses of all geoms, right for those.
+      still: visible geoms that are the same in all frames.
+      still_poses: poses of all geoms, valid for those.
+      still_mask: `[ngeom] bool`, which geoms these are.
       moving: the other visible geoms.
-      headlight: `[3] float32`, diffuse colour of the light along the camera's axis, or None.
-      shadows: whether the first light casts shadows.
+      shadows: indices of the lights that cast shadows, in the order of the look.
+      colour: the stage that colours the surface.
     """
 
+    spec: LookSpec
     size: tuple[int, int]
-    ngeom: int
     still: list[GeomGroup]
-    still_poses: Poses
+    still_poses: GeomPoses
+    still_mask: np.ndarray
     moving: list[GeomGroup]
-    headlight: np.ndarray | None
-    shadows: bool
+    shadows: tuple[int, ...]
+    colour: ColourStage
 
 
-def _make_plan(model: mujoco.MjModel, size: tuple[int, int], shadows: bool) -> _Plan:
-    visible, static = visible_geoms(model), static_geoms(model)
+def _make_plan(spec: LookSpec, size: tuple[int, int], shadows: bool) -> _Plan:
+    model = spec.model
+    visible, static = visible_geoms(model, spec.varies), static_geoms(model, spec.varies)
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
+    with jax.ensure_compile_time_eval():
+        still_poses = _check_poses(data.geom_xpos, data.geom_xmat, model.ngeom)
     return _Plan(
+        spec=spec,
         size=size,
-        ngeom=model.ngeom,
         still=geom_groups(model, visible & static),
-        still_poses=_check_poses(data.geom_xpos, data.geom_xmat, model.ngeom),
+        still_poses=still_poses,
+        still_mask=visible & static,
         moving=geom_groups(model, visible & ~static),
-        headlight=headlight_diffuse(model),
-        shadows=shadows and light_casts_shadow(model),
+        shadows=tuple(i for i, casts in enumerate(spec.casts_shadow()) if casts and shadows),
+        colour=geom_colour,
     )
 
 
-def _make_setting(plan: _Plan, appearance: Appearance) -> Setting:
+def _make_setting(plan: _Plan, look: Look, params: Params) -> Setting:
     height, width = plan.size
-    view = make_view(
-        appearance.camera_pos, appearance.camera_mat, appearance.camera_fovy, width / height
-    )
-    to_light = -appearance.light_dir
-    lights = [to_light / jnp.sqrt(jnp.sum(to_light**2))]
-    if plan.headlight is not None:
+    model = plan.spec.model
+    view = make_view(look.camera_pos, look.camera_mat, look.camera_fovy, width / height)
+    to_lights = [-direction for direction in look.light_dirs]
+    lights = [to_light / jnp.sqrt(jnp.sum(to_light**2)) for to_light in to_lights]
+    if plan.spec.headlight:
         lights.append(-view.basis[:, 2])
-    levels = jnp.round(jnp.clip(appearance.geom_rgb, 0, 1) * 255).astype(jnp.uint32)
-    ids = jnp.arange(plan.ngeom, dtype=jnp.uint32)
-    unlit = pack(levels[:, 0], levels[:, 1], levels[:, 2], ids)
-    return Setting(view, make_rays(view, jnp.stack(lights), plan.size), jnp.stack(lights), unlit)
+    towards = jnp.stack(lights) if lights else jnp.zeros((0, 3), jnp.float32)
+    levels = jnp.round(jnp.clip(look.geom_rgb, 0, 1) * 255).astype(jnp.uint32)
+    ids = jnp.arange(model.ngeom, dtype=jnp.uint32)
+    return Setting(
+        view=view,
+        rays=make_rays(view, towards, plan.size),
+        lights=towards,
+        sizes=fill(model, plan.spec.varies, params, "geom_size"),
+        unlit=pack(levels[:, 0], levels[:, 1], levels[:, 2], ids),
+        shown=look.geom_shown,
+    )
 
 
-def _background(plan: _Plan, appearance: Appearance) -> Surface:
-    setting = _make_setting(plan, appearance)
+def _background(plan: _Plan, look: Look) -> Surface:
+    setting = _make_setting(plan, look, own_params(plan.spec.model, plan.spec.varies))
     return cast(plan.still, plan.still_poses, setting, empty_surface(setting))
 
 
-def _draw(
+def _render(
     plan: _Plan,
-    own: Appearance,
-    background: Surface,
+    own: Look,
+    background: Surface | None,
     geom_xpos: ArrayLike,
     geom_xmat: ArrayLike,
-    appearance: Appearance | None,
+    params: Params | None,
+    camera_pose: CameraPose | None,
 ) -> tuple[jax.Array, jax.Array]:
     """Packed pixels, and the z-depth of the nearest surface."""
-    poses = _check_poses(geom_xpos, geom_xmat, plan.ngeom)
-    look = own if appearance is None else appearance
-    setting = _make_setting(plan, look)
-    if appearance is not None:
-        background = _background(plan, appearance)
+    spec, params = plan.spec, params or {}
+    check_params(spec.model, spec.varies, params)
+    _demand_camera_pose(spec, camera_pose)
+    poses = _check_poses(geom_xpos, geom_xmat, spec.model.ngeom)
+    look = own
+    if camera_pose is not None or any(field in spec.varies for field in LOOK_FIELDS):
+        look = make_look(spec, params, _check_camera_pose(camera_pose))
+    setting = _make_setting(plan, look, params)
+    if camera_pose is not None or background is None:
+        background = cast(plan.still, plan.still_poses, setting, empty_surface(setting))
     surface = cast(plan.moving, poses, setting, background)
     hit = surface.w > 0
     depth = 1 / jnp.where(hit, surface.w, jnp.ones_like(surface.w))
     cosines = incidence(surface, depth)
-    if plan.shadows:
-        dark = covered(plan.moving, poses, setting, depth)
-        dark = dark | covered(plan.still, plan.still_poses, setting, depth)
-        cosines[0] = jnp.where(dark, jnp.zeros_like(depth), cosines[0])
-    diffuse = [look.light_diffuse]
-    if plan.headlight is not None:
-        diffuse.append(jnp.asarray(plan.headlight))
-    packed = shade(surface, cosines, diffuse, look.ambient)
+    for light in plan.shadows:
+        dark = covered(plan.moving, poses, setting, depth, light)
+        dark = dark | covered(plan.still, plan.still_poses, setting, depth, light)
+        cosines[light] = jnp.where(dark, jnp.zeros_like(depth), cosines[light])
+    colour = plan.colour(surface, depth, setting, _all_poses(plan, poses))
+    packed = shade(colour, cosines, look.light_diffuse, look.ambient)
     return packed, jnp.where(hit, depth, jnp.inf)
+
+
+def _all_poses(plan: _Plan, poses: GeomPoses) -> GeomPoses:
+    still = plan.still_mask[:, None]
+    return GeomPoses(
+        jnp.where(still, plan.still_poses.xpos, poses.xpos),
+        jnp.where(still[..., None], plan.still_poses.xmat, poses.xmat),
+    )
 
 
 def _packed(
     plan: _Plan,
-    own: Appearance,
-    background: Surface,
+    own: Look,
+    background: Surface | None,
     geom_xpos: ArrayLike,
     geom_xmat: ArrayLike,
-    appearance: Appearance | None = None,
+    params: Params | None = None,
+    camera_pose: CameraPose | None = None,
 ) -> jax.Array:
-    packed, _ = _draw(plan, own, background, geom_xpos, geom_xmat, appearance)
+    packed, _ = _render(plan, own, background, geom_xpos, geom_xmat, params, camera_pose)
     return materialize(packed)[0]
 
 
 def _packed_and_depth(
     plan: _Plan,
-    own: Appearance,
-    background: Surface,
+    own: Look,
+    background: Surface | None,
     geom_xpos: ArrayLike,
     geom_xmat: ArrayLike,
-    appearance: Appearance | None = None,
+    params: Params | None = None,
+    camera_pose: CameraPose | None = None,
 ) -> tuple[jax.Array, jax.Array]:
-    packed, depth = _draw(plan, own, background, geom_xpos, geom_xmat, appearance)
+    packed, depth = _render(plan, own, background, geom_xpos, geom_xmat, params, camera_pose)
     packed, depth = materialize(packed, depth)
     return packed, depth
 
 
-def _check_poses(geom_xpos: ArrayLike, geom_xmat: ArrayLike, ngeom: int) -> Poses:
+def _check_poses(geom_xpos: ArrayLike, geom_xmat: ArrayLike, ngeom: int) -> GeomPoses:
     xpos, xmat = jnp.asarray(geom_xpos, jnp.float32), jnp.asarray(geom_xmat, jnp.float32)
     if xpos.shape != (ngeom, 3) or xmat.shape not in ((ngeom, 3, 3), (ngeom, 9)):
         raise ValueError(
             f"geom_xpos {list(xpos.shape)} and geom_xmat {list(xmat.shape)} must be [{ngeom}, 3] "
             f"and [{ngeom}, 3, 3], the poses of one frame; use jax.vmap for several"
         )
-    return Poses(xpos, xmat.reshape(ngeom, 3, 3))
+    return GeomPoses(xpos, xmat.reshape(ngeom, 3, 3))
+
+
+def _check_camera_pose(camera_pose: CameraPose | None) -> CameraPose | None:
+    if camera_pose is None:
+        return None
+    pos, mat = (jnp.asarray(part, jnp.float32) for part in camera_pose)
+    if pos.shape != (3,) or mat.shape not in ((3, 3), (9,)):
+        raise ValueError(
+            f"camera_pose has the shapes {list(pos.shape)} and {list(mat.shape)}; it must be a "
+            "position [3] and axes [3, 3], the pose of one frame; use jax.vmap for several"
+        )
+    return pos, mat.reshape(3, 3)
+
+
+def _demand_camera_pose(spec: LookSpec, camera_pose: CameraPose | None) -> None:
+    if spec.camera_moves and camera_pose is None:
+        raise ValueError(
+            f"camera {spec.camera_name!r} is on a moving body: pass its camera_pose, as "
+            "mjx_arm.kinematics.make_camera_pose computes it"
+        )
+
+
+def _validate_varies(model: mujoco.MjModel, varies: Varies | None) -> None:
+    check_varies(model, varies)
+    for field in _CONSTANT_FIELDS:
+        if field in (varies or {}):
+            raise ValueError(
+                f"{field!r} changes the image, but the renderer cannot vary it by episode; "
+                f"it varies {', '.join(('geom_size', *LOOK_FIELDS))}"
+            )
 
 
 def _validate_size(size: object) -> None:

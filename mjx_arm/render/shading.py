@@ -8,17 +8,18 @@ import jax
 import jax.numpy as jnp
 
 from mjx_arm.render.algebra import greater, lesser
-from mjx_arm.render.packing import pack, unpack
+from mjx_arm.render.colour import Colour
+from mjx_arm.render.packing import pack
 from mjx_arm.render.surface import Surface
 
 
 def shade(
-    surface: Surface, cosines: Sequence[jax.Array], diffuse: Sequence[jax.Array], ambient: jax.Array
+    colour: Colour, cosines: Sequence[jax.Array], diffuse: Sequence[jax.Array], ambient: jax.Array
 ) -> jax.Array:
-    """Lights a surface.
+    """Lights a coloured surface.
 
     Args:
-      surface: the nearest surface.
+      colour: its own colour.
       cosines: per light, `[H, W] float32`, cosines of incidence, 0 in shadow.
       diffuse: per light, `[3] float32`, its colour.
       ambient: `[3] float32`, colour of the light that reaches everything.
@@ -26,15 +27,14 @@ def shade(
     Returns:
       `[H, W] uint32`, packed pixels.
     """
-    *channels, geom = unpack(surface.unlit)
     lit = []
-    for channel, own in enumerate(channels):
+    for channel, own in enumerate((colour.red, colour.green, colour.blue)):
         light = ambient[channel]
-        for colour, cosine in zip(diffuse, cosines, strict=True):
-            light = light + colour[channel] * cosine
-        value = own.astype(jnp.float32) * light + 0.5
+        for level, cosine in zip(diffuse, cosines, strict=True):
+            light = light + level[channel] * cosine
+        value = own * light + 0.5
         lit.append(lesser(value, jnp.full_like(value, 255.0)).astype(jnp.uint32))
-    return pack(lit[0], lit[1], lit[2], geom)
+    return pack(lit[0], lit[1], lit[2], colour.geom)
 
 
 def incidence(surface: Surface, depth: jax.Array) -> list[jax.Array]:

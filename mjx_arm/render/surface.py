@@ -1,4 +1,4 @@
-"""The nearest surface at every pixel, before it is lit."""
+"""The nearest surface at every pixel, before it is coloured and lit."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from mjx_arm.render import primitives, shadows
 from mjx_arm.render.geoms import GeomGroup
@@ -45,23 +46,27 @@ class Surface(NamedTuple):
 
 
 class Setting(NamedTuple):
-    """How a frame is looked at and lit.
+    """Camera, lights, sizes and colours of a frame.
 
     Attributes:
       view: the camera.
       rays: its rays.
       lights: `[L, 3] float32`, unit vectors towards the lights.
+      sizes: `[ngeom, 3] float32`, as `geom_size` of the model, m.
       unlit: `[ngeom] uint32`, packed pixel of each geom in its own colour.
+      shown: `[ngeom] bool`, whether each geom is shown; None if all are.
     """
 
     view: View
     rays: Rays
     lights: jax.Array
+    sizes: jax.Array | np.ndarray
     unlit: jax.Array
+    shown: jax.Array | None
 
 
-class Poses(NamedTuple):
-    """Where all geoms are: `xpos [ngeom, 3] float32`, m, and `xmat [ngeom, 3, 3] float32`."""
+class GeomPoses(NamedTuple):
+    """Poses of all geoms: `xpos [ngeom, 3] float32`, m, and `xmat [ngeom, 3, 3] float32`."""
 
     xpos: jax.Array
     xmat: jax.Array
@@ -74,32 +79,43 @@ def empty_surface(setting: Setting) -> Surface:
     return Surface(nothing, tuple(nothing for _ in setting.rays.to_light), unlit)
 
 
-def cast(groups: Sequence[GeomGroup], poses: Poses, setting: Setting, surface: Surface) -> Surface:
-    """Puts the geoms of `groups` into a surface, where they are nearer."""
+def cast(
+    groups: Sequence[GeomGroup], poses: GeomPoses, setting: Setting, surface: Surface
+) -> Surface:
+    """Returns the surface with the geoms of `groups` added where they are nearer."""
 
     def prepare(kind: str, size: jax.Array, xpos: jax.Array, xmat: jax.Array) -> Any:
         sight = primitives.make_sight(xpos, xmat, setting.view, setting.lights)
         return _CASTS[kind][0](size, sight)
 
     for group in groups:
-        for geom, coefficients in zip(group.ids, _each(prepare, group, poses), strict=True):
+        for geom, coefficients in zip(
+            group.ids, _each(prepare, group, poses, setting), strict=True
+        ):
             hit = _CASTS[group.kind][1](coefficients, setting.rays)
+            if setting.shown is not None:
+                hit = hit._replace(hit=hit.hit & setting.shown[geom])
             surface = _nearer(surface, hit, setting.unlit[geom])
     return surface
 
 
 def covered(
-    groups: Sequence[GeomGroup], poses: Poses, setting: Setting, depth: jax.Array
+    groups: Sequence[GeomGroup],
+    poses: GeomPoses,
+    setting: Setting,
+    depth: jax.Array,
+    light: int,
 ) -> jax.Array:
-    """Whether any geom is between a pixel's surface and the first light, `[H, W] bool`.
+    """Whether any geom is between a pixel's surface and a light, `[H, W] bool`.
 
     Args:
       groups: the geoms that cast shadows; planes among them do not.
-      poses: where they are.
+      poses: poses of all geoms.
       setting: camera and lights.
       depth: `[H, W] float32`, z-depth of the surface, m.
+      light: index of the light in `setting`.
     """
-    space = shadows.make_light_space(setting.lights[0], setting.view.origin)
+    space = shadows.make_light_space(setting.lights[light], setting.view.origin)
     points = shadows.surface_points(space, setting.view, setting.rays, depth)
 
     def prepare(kind: str, size: jax.Array, xpos: jax.Array, xmat: jax.Array) -> Any:
@@ -108,15 +124,21 @@ def covered(
     result = jnp.zeros(depth.shape, bool)
     for group in groups:
         if group.kind in _SHADOWS:
-            for outline in _each(prepare, group, poses):
-                result = result | _SHADOWS[group.kind][1](outline, points)
+            outlines = _each(prepare, group, poses, setting)
+            for geom, outline in zip(group.ids, outlines, strict=True):
+                covers = _SHADOWS[group.kind][1](outline, points)
+                if setting.shown is not None:
+                    covers = covers & setting.shown[geom]
+                result = result | covers
     return result
 
 
-def _each(prepare: Callable[..., Any], group: GeomGroup, poses: Poses) -> list[Any]:
-    """What `prepare` makes of each geom of a group, computed for all of them at once."""
+def _each(
+    prepare: Callable[..., Any], group: GeomGroup, poses: GeomPoses, setting: Setting
+) -> list[Any]:
+    """What `prepare` returns for each geom of a group, computed for all of them at once."""
     prepared = jax.vmap(lambda *geom: prepare(group.kind, *geom))(
-        jnp.asarray(group.sizes), poses.xpos[group.ids], poses.xmat[group.ids]
+        jnp.asarray(setting.sizes[group.ids]), poses.xpos[group.ids], poses.xmat[group.ids]
     )
     return [jax.tree.map(lambda leaf, i=i: leaf[i], prepared) for i in range(len(group.ids))]
 
