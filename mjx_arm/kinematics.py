@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from mjx_arm.varies import Params, Varies, fill
+from mjx_arm.varies import Params, Varies, check_params, check_varies
 
 _FREE = int(mujoco.mjtJoint.mjJNT_FREE)
 _HINGE = int(mujoco.mjtJoint.mjJNT_HINGE)
@@ -43,15 +43,36 @@ class Poses:
     site_xpos: jax.Array
 
 
-def make_kinematics(mj_model: mujoco.MjModel, varies: Varies | None = None) -> Callable[..., Poses]:
-    """Makes `poses(qpos)`, MuJoCo's `mj_kinematics` for free, hinge and slide joints.
+class Kinematics(Protocol):
+    """World poses at `qpos [nq] float32`; see `make_kinematics`."""
+
+    def __call__(self, qpos: jax.Array, params: Params | None = None) -> Poses:
+        """Computes the poses of one state."""
+        ...
+
+
+class CameraPose(Protocol):
+    """World pose of a camera at `qpos [nq] float32`; see `make_camera_pose`."""
+
+    def __call__(
+        self, qpos: jax.Array, params: Params | None = None
+    ) -> tuple[jax.Array, jax.Array]:
+        """Computes position `[3]` and axes `[3, 3]` at one state."""
+        ...
+
+
+def make_kinematics(mj_model: mujoco.MjModel, varies: Varies | None = None) -> Kinematics:
+    """Makes `kinematics(qpos, params={})`, MuJoCo's `mj_kinematics` in pure JAX.
+
+    A quaternion need not have unit length; a zero quaternion is the identity, as in MuJoCo.
 
     Args:
-      mj_model: a model without ball joints and mocap bodies.
-      varies: what varies by episode; `geom_pos`, `geom_quat`, `body_pos` and `body_quat` are read.
+      mj_model: a model with free, hinge and slide joints, and without mocap bodies.
+      varies: which rows of the model vary by episode. Of these the function reads `geom_pos`,
+        `geom_quat`, `body_pos` and `body_quat` from its `params`.
 
     Returns:
-      A pure function from `qpos [nq] float32` and params to `Poses`.
+      A pure function from `qpos [nq] float32` and `Params` to `Poses`.
 
     Raises:
       ValueError: the model has a joint or body that is not supported, or `varies` has an unknown
@@ -61,31 +82,16 @@ def make_kinematics(mj_model: mujoco.MjModel, varies: Varies | None = None) -> C
     _check_bodies(mj_model, range(mj_model.nbody))
     _check_varies(mj_model, varies)
 
-    varies = {} if varies is None else varies
-
-    def poses(qpos: jax.Array, params: Params | None = None) -> Poses:
-        # Fields that do not vary keep the model's float64 values.
-        geom_pos, geom_quat, body_pos, body_quat = (
-            fill(mj_model, varies, params, name) if name in varies else getattr(mj_model, name)
-            for name in ("geom_pos", "geom_quat", "body_pos", "body_quat")
-        )
-        position: list[_Vector] = [[0.0, 0.0, 0.0]]
-        rotation: list[_Matrix] = [[[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]]
-        for body in range(1, mj_model.nbody):
-            pos, rot = _body_pose(mj_model, body, qpos, position, rotation, body_pos, body_quat)
-            position.append(pos)
-            rotation.append(rot)
-        geom_xpos = [
-            _transform(position[body], rotation[body], _vector(offset))
-            for body, offset in zip(mj_model.geom_bodyid, geom_pos, strict=True)
-        ]
+    def kinematics(qpos: jax.Array, params: Params | None = None) -> Poses:
+        check_params(mj_model, varies, params)
+        read = _make_read(mj_model, varies, params)
+        frames = _body_frames(mj_model, range(mj_model.nbody), qpos, read)
+        geoms = [frames[body] for body in mj_model.geom_bodyid]
+        sites = [frames[body] for body in mj_model.site_bodyid]
+        geom_xpos = [_transform(*frame, read("geom_pos", i)) for i, frame in enumerate(geoms)]
         geom_xmat = [
-            _multiply(rotation[body], _constant_rotation(quat))
-            for body, quat in zip(mj_model.geom_bodyid, geom_quat, strict=True)
-        ]
-        site_xpos = [
-            _transform(position[body], rotation[body], _vector(offset))
-            for body, offset in zip(mj_model.site_bodyid, mj_model.site_pos, strict=True)
+            _multiply(rotation, _rotation(read("geom_quat", i)))
+            for i, (_, rotation) in enumerate(geoms)
         ]
         site_xpos = [_transform(*frame, read("site_pos", i)) for i, frame in enumerate(sites)]
         return Poses(
@@ -97,23 +103,130 @@ def make_kinematics(mj_model: mujoco.MjModel, varies: Varies | None = None) -> C
     return kinematics
 
 
-def _body_pose(
-    model: mujoco.MjModel,
-    body: int,
-    qpos: jax.Array,
-    position: list[_Vector],
-    rotation: list[_Matrix],
-    body_pos: jax.Array | np.ndarray,
-    body_quat: jax.Array | np.ndarray,
-) -> tuple[_Vector, _Matrix]:
-    parent = model.body_parentid[body]
+def make_camera_pose(
+    mj_model: mujoco.MjModel, camera: str, varies: Varies | None = None
+) -> CameraPose:
+    """Makes `camera_pose(qpos, params={})`, the world pose of a camera on any body.
+
+    The renderer of a camera on a moving body takes the result as its `camera_pose`.
+
+    Args:
+      mj_model: the model. From the world to the camera's body it has free, hinge and slide joints
+        only, and no mocap body.
+      camera: name of a camera of mode `fixed`: one that moves with its body.
+      varies: which rows of the model vary by episode. Of these the function reads `cam_pos`,
+        `cam_quat`, `body_pos` and `body_quat` from its `params`.
+
+    Returns:
+      A pure function from `qpos [nq] float32` and `Params` to the position, `[3] float32`, m, and
+      the axes in columns, `[3, 3] float32`: x right, y up, looking along -z.
+
+    Raises:
+      ValueError: the camera is unknown or of another mode, or as `make_kinematics`.
+    """
+    camera_id = find_camera(mj_model, camera)
+    chain = _chain(mj_model, mj_model.cam_bodyid[camera_id])
+    _check_bodies(mj_model, chain)
+    _check_varies(mj_model, varies)
+
+    def camera_pose(qpos: jax.Array, params: Params | None = None) -> tuple[jax.Array, jax.Array]:
+        check_params(mj_model, varies, params)
+        read = _make_read(mj_model, varies, params)
+        frame = _body_frames(mj_model, chain, qpos, read)[chain[-1]]
+        pos = _transform(*frame, read("cam_pos", camera_id))
+        mat = _multiply(frame[1], _rotation(read("cam_quat", camera_id)))
+        return _stack([pos]), _stack(mat).reshape(3, 3)
+
+    return camera_pose
+
+
+def find_camera(mj_model: mujoco.MjModel, camera: str) -> int:
+    """Returns the id of a camera that is fixed to a body.
+
+    Raises:
+      ValueError: the camera is unknown, or its mode is not `fixed`.
+    """
+    names = [mj_model.camera(i).name for i in range(mj_model.ncam)]
+    if camera not in names:
+        raise ValueError(f"unknown camera {camera!r}: the scene has {names}")
+    camera_id = names.index(camera)
+    mode = mujoco.mjtCamLight(int(mj_model.cam_mode[camera_id]))
+    if mode != mujoco.mjtCamLight.mjCAMLIGHT_FIXED:
+        name = mode.name.removeprefix("mjCAMLIGHT_").lower()
+        raise ValueError(f"camera {camera!r} has the mode {name!r}; supported is mode='fixed' only")
+    return camera_id
+
+
+def _check_bodies(mj_model: mujoco.MjModel, bodies: Sequence[int]) -> None:
+    for joint in np.flatnonzero(np.isin(mj_model.jnt_bodyid, bodies)).tolist():
+        if mj_model.jnt_type[joint] not in (_FREE, _HINGE, _SLIDE):
+            raise ValueError(
+                f"joint {mj_model.joint(joint).name!r} is a ball joint; "
+                "supported are free, hinge and slide joints"
+            )
+    if np.any(mj_model.body_mocapid[list(bodies)] >= 0):
+        raise ValueError("the scene has mocap bodies, which are not supported")
+
+
+def _check_varies(mj_model: mujoco.MjModel, varies: Varies | None) -> None:
+    check_varies(mj_model, varies)
+    for field in varies or {}:
+        if field in _CONSTANT_FIELDS:
+            raise ValueError(
+                f"{field!r} cannot vary by episode; poses may vary by geom_pos, geom_quat, "
+                "body_pos and body_quat"
+            )
+
+
+def _chain(model: mujoco.MjModel, body: int) -> list[int]:
+    """The world and all bodies from there to `body`."""
+    chain = [int(body)]
+    while chain[0]:
+        chain.insert(0, int(model.body_parentid[chain[0]]))
+    return chain
+
+
+def _make_read(model: mujoco.MjModel, varies: Varies | None, params: Params | None) -> _Read:
+    """Makes `read(field, row)`, the numbers of a row: traced where it varies, else constants."""
+    place = {field: {row: k for k, row in enumerate(ids)} for field, ids in (varies or {}).items()}
+
+    def read(field: str, row: int) -> _Vector:
+        k = place.get(field, {}).get(row)
+        if k is None:
+            return _vector(getattr(model, field)[row])
+        return list(jnp.asarray((params or {})[field][k], jnp.float32))
+
+    return read
+
+
+def _body_frames(
+    model: mujoco.MjModel, bodies: Sequence[int], qpos: jax.Array, read: _Read
+) -> dict[int, _Frame]:
+    """Position and rotation of each of `bodies`, which lists parents before their children."""
+    frames: dict[int, _Frame] = {0: ([0.0, 0.0, 0.0], _constant_rotation([1.0, 0.0, 0.0, 0.0]))}
+    tilted: set[int] = set()
+    for body in bodies:
+        if body == 0:
+            continue
+        frame = _body_frame(model, body, qpos, read, frames)
+        if int(model.body_parentid[body]) in tilted or _is_tilted(model, body, read):
+            tilted.add(body)
+            frame = _fence(frame)
+        frames[body] = frame
+    return frames
+
+
+def _body_frame(
+    model: mujoco.MjModel, body: int, qpos: jax.Array, read: _Read, frames: dict[int, _Frame]
+) -> _Frame:
     first = model.body_jntadr[body]
     joints = range(first, first + model.body_jntnum[body])
     if len(joints) and model.jnt_type[first] == _FREE:
         start = model.jnt_qposadr[first]
         return list(qpos[start : start + 3]), _quat_to_mat(qpos[start + 3 : start + 7])
-    pos = _transform(position[parent], rotation[parent], _vector(body_pos[body]))
-    rot = _multiply(rotation[parent], _constant_rotation(body_quat[body]))
+    parent = frames[int(model.body_parentid[body])]
+    pos = _transform(*parent, read("body_pos", body))
+    rot = _multiply(parent[1], _rotation(read("body_quat", body)))
     for joint in joints:
         address = model.jnt_qposadr[joint]
         value = qpos[address] - float(model.qpos0[address])
@@ -229,11 +342,10 @@ def _quat_to_mat(quat: jax.Array | _Vector) -> _Matrix:
     ]
 
 
-def _constant_rotation(quat: np.ndarray | jax.Array) -> _Matrix:
-    if isinstance(quat, jax.Array):
-        return _quat_to_mat(quat)
-    mat = np.empty(9)
-    mujoco.mju_quat2Mat(mat, quat)
+def _constant_rotation(quat: Sequence[float]) -> _Matrix:
+    unit, mat = np.array(quat), np.empty(9)
+    mujoco.mju_normalize4(unit)
+    mujoco.mju_quat2Mat(mat, unit)
     # Rounded, or the last bits of a converted Euler angle would hide an exact 0 or 1.
     return [_vector(row) for row in mat.reshape(3, 3).round(12)]
 

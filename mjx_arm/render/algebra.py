@@ -1,4 +1,4 @@
-"""Small arithmetic, exact in float32 on every device and cheap inside of a fused kernel."""
+"""Small arithmetic in full float32 precision on every device, cheap inside a fused kernel."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import jax.numpy as jnp
 
 
 def matvec(matrix: jax.Array, vector: jax.Array) -> jax.Array:
-    """Returns `matrix [m, n]` times `vector [n]`; a dot would lose precision on accelerators."""
+    """Returns `matrix [m, n]` times `vector [n]`; jnp.dot has less precision on accelerators."""
     return jnp.sum(matrix * vector, axis=-1)
 
 
@@ -17,7 +17,7 @@ def matmul(left: jax.Array, right: jax.Array) -> jax.Array:
 
 
 def lesser(a: jax.Array, b: jax.Array) -> jax.Array:
-    """Returns the smaller one: a single instruction, since unlike jnp.minimum it drops NaNs."""
+    """Returns the smaller one. It is a single instruction, because it does not keep NaNs."""
     return jnp.where(a < b, a, b)
 
 

@@ -136,6 +136,8 @@ def varying_bodies(mj_model: mujoco.MjModel, varies: Varies | None) -> np.ndarra
     varying = np.zeros(mj_model.nbody, bool)
     for field in ("body_pos", "body_quat"):
         varying[list((varies or {}).get(field, ()))] = True
+    # The world's own pose is never read.
+    varying[0] = False
     for body in range(1, mj_model.nbody):
         varying[body] |= varying[mj_model.body_parentid[body]]
     return varying

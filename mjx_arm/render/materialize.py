@@ -1,4 +1,4 @@
-"""A wall behind an image, so that XLA casts its rays once and not once per consumer."""
+"""A fence after an image, so that XLA casts its rays once and not once per consumer."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jax.custom_batching import custom_vmap
 
-# No packed pixel has this value: where nothing is hit, the colour is black.
+# No packed pixel has this value: its geom id means that nothing is hit, and that is black.
 _IMPOSSIBLE = 0xFFFFFFFF
 
 
@@ -16,10 +16,10 @@ _IMPOSSIBLE = 0xFFFFFFFF
 def materialize(packed: jax.Array, *others: jax.Array) -> tuple[jax.Array, ...]:
     """Returns its arguments unchanged, but computed before anything that reads them.
 
-    XLA on CPU fuses a producer into every consumer, which repeats the ray cast for each, and
-    `optimization_barrier` does not keep it from that. A branch that depends on the data does.
-    The condition is of the whole batch, because a batched branch would become a select; hence
-    the rule for `vmap`.
+    XLA on CPU fuses a producer into every consumer, which repeats the ray cast for each of them.
+    `optimization_barrier` does not prevent it; a branch that depends on the data does. Under
+    `vmap` a branch with one condition per frame would become a select. The rule for `vmap`
+    therefore uses one condition for the whole batch.
 
     Args:
       packed: `[...] uint32`, packed pixels, at least one.

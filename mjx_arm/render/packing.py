@@ -9,12 +9,12 @@ NO_GEOM = 255
 
 
 def pack(red: jax.Array, green: jax.Array, blue: jax.Array, geom: jax.Array) -> jax.Array:
-    """Joins byte values, each `[...] uint32`, to packed pixels, `[...] uint32`."""
+    """Packs byte values, each `[...] uint32`, into pixels, `[...] uint32`."""
     return red | (green << 8) | (blue << 16) | (geom << 24)
 
 
 def unpack(packed: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
-    """Splits packed pixels into red, green, blue and geom id, each `[...] uint32`."""
+    """Unpacks pixels into red, green, blue and geom id, each `[...] uint32`."""
     return packed & 255, (packed >> 8) & 255, (packed >> 16) & 255, packed >> 24
 
 

@@ -1,20 +1,20 @@
 """Casting rays at one plane, box, sphere, capsule or cylinder.
 
-Every primitive comes in two halves. `*_coefficients` runs once per geom and frame: it reduces the
-geom, the camera and the lights to a few scalars. `*_hit` runs at every pixel and is a handful of
+Every primitive has two functions. `*_coefficients` runs once per geom and frame: it reduces the
+geom, the camera and the lights to a few scalars. `*_hit` runs at every pixel: it needs a few
 multiply-adds on those scalars.
 
 Distances are inverse depths: `w` is 1 / z-depth, in 1/m, and the nearest surface has the largest.
 From a fixed origin the plane of a face is crossed at a `w` that is affine in the screen
 coordinates, and a quadric at one that is affine plus the root of a quadratic. A convex body is hit
 where the last entry into its faces comes before the first exit: where the smallest `w` among the
-entries is at least the largest among the exits. A `w` that is not positive is behind the camera:
-it needs no test here, since it is nearer than nothing.
+entries is at least the largest among the exits. A `w` that is not positive is behind the camera.
+It needs no test here, because an empty pixel has `w = 0` and the larger `w` wins.
 
-Shading travels as `lambert`, which is `w` times the cosine of incidence: that too is affine in `w`
-and the screen coordinates, so nothing is divided until the nearest geom is known.
+Shading is carried as `lambert`, which is `w` times the cosine of incidence. It is affine in `w` and
+the screen coordinates, so there is no division until the nearest geom is known.
 
-A geom around the camera and a plane seen from behind are not drawn, as with OpenGL's back-face
+A geom around the camera and a plane seen from behind are not rendered, as with OpenGL's back-face
 culling.
 """
 
@@ -91,7 +91,7 @@ def _make_slab(origin: jax.Array, form: jax.Array, half: jax.Array) -> Slab:
 
 
 def _never(slab: Slab, condition: jax.Array) -> Slab:
-    """The slab, but entered only behind the camera if the condition holds."""
+    """Returns the slab, but entered only behind the camera if the condition holds."""
     behind = jnp.zeros_like(slab.near).at[..., 2].set(-1.0)
     return Slab(
         jnp.where(condition, behind, slab.near),
@@ -353,15 +353,15 @@ class Capsule(NamedTuple):
     """A tube between two half spheres.
 
     A ray that enters a capsule through an end enters its tube beyond that end. So the height at
-    which it enters the tube tells which one sphere to try.
+    which it enters the tube decides which of the two spheres is tested.
 
     Attributes:
       tube: the side.
       axial: `[3]`, form of the direction along the axis.
       height: `[]`, the camera's height along the axis, m.
       half: `[]`, half length of the straight part, m.
-      beyond: `[]`, added to the tube's height to choose the end: 0; or plus or minus huge where
-        the camera is inside of the tube and sees only the end on its own side.
+      beyond: `[]`, added to the tube's height to choose the end: 0, or plus or minus huge where
+        the camera is inside the tube and sees only the end on its own side.
       towards: `[3]`, form of the direction along the offset to the centre, m.
       power: `[2]`, squared lengths of the tangents to the ends at +half and -half, m².
       inverse_power: `[2]`, 1/m².

@@ -1,4 +1,4 @@
-"""The pencil of rays through the pixels of an image, and what is affine in it.
+"""The rays through the pixels of an image, and affine functions of their screen coordinates.
 
 A pixel has screen coordinates (u, v) in -1..1, u to the right and v upwards, and its ray is
 `origin + t * (u * right + v * up + forward)` with `forward` of unit length along the optical
@@ -30,13 +30,14 @@ class View(NamedTuple):
 
 
 class Rays(NamedTuple):
-    """What all geoms share at each pixel.
+    """What is the same for all geoms at each pixel.
 
     Attributes:
       u: `[1, W] float32`.
       v: `[H, 1] float32`.
       norm2: `[H, W] float32`, squared length of the ray's direction.
-      to_light: per light, `[H, W] float32`, the ray's direction along the one to the light.
+      to_light: per light, `[H, W] float32`, dot product of the ray's direction and the unit vector
+        towards the light.
     """
 
     u: jax.Array

@@ -1,12 +1,12 @@
 """Hard shadows of a directional light: is a body between a surface point and the light?
 
-Points and bodies are put in light space, whose z axis runs towards the light. There every shadow
-ray is vertical: a body covers a point if its outline does, and if it is above the point. Since
-points lie on surfaces and not within bodies, "above" is tested against some height inside of the
-body on the same ray. That needs no bias, since a lit point is above the inside of its own body.
+Points and bodies are transformed to light space, whose z axis points towards the light. There
+every shadow ray is vertical: a body covers a point if the point is within the body's outline and
+below the body. Points lie on surfaces, so "below" is tested against a height inside the body on
+the same ray. This needs no bias, because a lit point is above the inside of its own body.
 
-Like the primitives, every body comes in two halves: `*_outline` runs once per geom and frame, and
-`*_covers` at every pixel. Planes cast no shadow: light from behind a wall shines through.
+Like a primitive, every body has two functions: `*_outline` runs once per geom and frame, and
+`*_covers` at every pixel. Planes cast no shadow: light reaches a surface behind one.
 """
 
 from __future__ import annotations

@@ -1,11 +1,16 @@
-"""Scenes to draw, and MuJoCo's own answers to what a camera sees of them."""
+"""Scenes to render, and MuJoCo's own answers to what a camera sees of them."""
 
 from __future__ import annotations
+
+import pathlib
 
 import mujoco
 import numpy as np
 
+from mjx_arm.render.geoms import geom_rgba
 from mjx_arm.scene import Scene
+
+ARM_XML = pathlib.Path(__file__).parents[2] / "xml" / "arm_cube.xml"
 
 SHOWN_GROUPS = np.asarray([1, 1, 1, 0, 0, 0], np.uint8)
 _RAY_RANGE = 1e10
@@ -17,7 +22,7 @@ def scene_of(xml: str) -> Scene:
     return Scene(name="test", mj_model=mujoco.MjModel.from_xml_string(xml))
 
 
-def random_primitives(seed: int, count: int = 8) -> Scene:
+def random_primitives(seed: int, count: int = 8, lights: str = "") -> Scene:
     """Free bodies of all round and flat shapes over a floor, before a wall of finite size."""
     rng = np.random.default_rng(seed)
     bodies = []
@@ -41,6 +46,7 @@ def random_primitives(seed: int, count: int = 8) -> Scene:
   <worldbody>
     <light type="directional" pos="-1 -1 2.5" dir="0.5 0.3 -1" diffuse="0.5 0.55 0.4"
            specular="0 0 0"/>
+    {lights}
     <camera name="front" pos="1.3 -0.9 1.1" xyaxes="0.57 0.82 0 -0.45 0.31 0.84" fovy="50"/>
     <geom name="floor" type="plane" size="0 0 1" rgba="0.4 0.4 0.35 1"/>
     <geom name="wall" type="plane" size="0.4 0.7 1" pos="-0.7 0.3 0.4" euler="0 80 0"
@@ -126,3 +132,26 @@ def cast_camera(
     number = model.camera(camera).id
     directions = pixel_rays(data.cam_xmat[number], model.cam_fovy[number], size)
     return cast_rays(model, data, data.cam_xpos[number], directions)
+
+
+def shaded(
+    model: mujoco.MjModel, data: mujoco.MjData, camera: str, geom: np.ndarray, normal: np.ndarray
+) -> np.ndarray:
+    """Colours `[H, W, 3]` in 0..255 of what `cast_camera` found, without shadows."""
+    headlight = model.vis.headlight
+    axis = data.cam_xmat[model.camera(camera).id].reshape(3, 3)[:, 2]
+    light = headlight.ambient + np.maximum(normal @ axis, 0)[..., None] * headlight.diffuse
+    for i in np.flatnonzero(model.light_active):
+        cosine = np.maximum(normal @ -data.light_xdir[i], 0)[..., None]
+        light = light + model.light_ambient[i] + cosine * model.light_diffuse[i]
+    colour = np.where(geom[..., None] >= 0, geom_rgba(model)[geom, :3], 0)
+    return 255 * np.minimum(colour * light, 1)
+
+
+def wrist_scene() -> Scene:
+    """The arm, with a camera `wrist` on its gripper."""
+    spec = mujoco.MjSpec.from_file(str(ARM_XML))
+    spec.body("gripper").add_camera(
+        name="wrist", pos=[0.03, 0.01, 0.06], quat=[0.55, 0.38, -0.47, -0.58], fovy=70
+    )
+    return Scene(name="wrist", mj_model=spec.compile())

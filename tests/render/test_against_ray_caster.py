@@ -5,10 +5,9 @@ from __future__ import annotations
 import jax
 import numpy as np
 import pytest
-from mujoco_reference import at, cast_camera, geom_poses, random_qpos
+from mujoco_reference import at, cast_camera, geom_poses, random_qpos, shaded
 
 from mjx_arm import make_renderer, rgb, segmentation
-from mjx_arm.render.geoms import geom_rgba
 from mjx_arm.scene import Scene
 
 POSES = 50
@@ -49,12 +48,7 @@ def test_shading_follows_the_normals(primitives: Scene) -> None:
     states = [at(model, qpos) for qpos in qposes]
     truth = [cast_camera(model, data, "front", size) for data in states]
     geom, _, normal = (np.stack(part) for part in zip(*truth, strict=True))
-    headlight = model.vis.headlight
-    forward = -states[0].cam_xmat[0].reshape(3, 3)[:, 2]
-    light = headlight.ambient + np.zeros(normal.shape)
-    light += np.maximum(normal @ -states[0].light_xdir[0], 0)[..., None] * model.light_diffuse[0]
-    light += np.maximum(normal @ -forward, 0)[..., None] * headlight.diffuse
-    expected = 255 * np.minimum(geom_rgba(model)[geom, :3] * light, 1)
+    expected = shaded(model, states[0], "front", geom, normal)
     error = np.abs(np.asarray(rgb(packed)) - expected)[np.asarray(segmentation(packed)) == geom]
     assert np.percentile(error, 99.9) < MAX_LEVELS
 

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from mujoco_reference import at, cast_rays, geom_poses, pixel_rays, random_qpos, scene_of
 
-from mjx_arm import default_appearance, make_renderer, rgb, segmentation
+from mjx_arm import make_renderer, rgb, segmentation
 from mjx_arm.scene import Scene
 
 SIZE = (32, 32)
@@ -47,16 +45,11 @@ def _look(
     scene: Scene, pos: np.ndarray, mat: np.ndarray, shadows: bool = False
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Colours, geom ids and depths of N views from `pos [N, 3]` with axes `mat [N, 3, 3]`."""
-    own = default_appearance(scene)
-    looks = jax.vmap(
-        lambda p, m: dataclasses.replace(
-            own, camera_pos=p, camera_mat=m, camera_fovy=jnp.float32(FOVY)
-        )
-    )(jnp.asarray(pos, jnp.float32), jnp.asarray(mat, jnp.float32))
+    params = {"cam_fovy": jnp.full(1, FOVY, jnp.float32)}
     data = at(scene.mj_model)
-    render = make_renderer(scene, size=SIZE, shadows=shadows, depth=True)
-    views = jax.jit(jax.vmap(render, in_axes=(None, None, 0)))
-    packed, depth = views(data.geom_xpos, data.geom_xmat, looks)
+    render = make_renderer(scene, size=SIZE, shadows=shadows, depth=True, varies={"cam_fovy": (0,)})
+    views = jax.jit(jax.vmap(render, in_axes=(None, None, None, 0)))
+    packed, depth = views(data.geom_xpos, data.geom_xmat, params, (pos, mat))
     return np.asarray(rgb(packed)), np.asarray(segmentation(packed)), np.asarray(depth)
 
 
@@ -91,7 +84,7 @@ def _assert_same(scene: Scene, pos: np.ndarray, mat: np.ndarray) -> None:
 
 
 def _outside(scene: Scene, pos: np.ndarray) -> np.ndarray:
-    """Whether points are outside of the only geom; a geom around the camera is not drawn."""
+    """Whether points are outside of the only geom; a geom around the camera is not rendered."""
     data = at(scene.mj_model)
     normals = np.concatenate([np.eye(3), -np.eye(3)])
     geoms = [cast_rays(scene.mj_model, data, p, normals)[0] for p in pos]
@@ -125,14 +118,14 @@ def test_geoms_behind_the_camera(shape: str) -> None:
 
 
 @pytest.mark.parametrize("shape", ["box", "sphere", "capsule", "cylinder"])
-def test_a_geom_around_the_camera_is_not_drawn(shape: str) -> None:
+def test_a_geom_around_the_camera_is_not_rendered(shape: str) -> None:
     scene = _one_geom(shape)
     pos = np.asarray([[0.0, 0.0, 0.0], [0.005, -0.01, 0.05], [0.0, 0.0, -0.19]])
     mat = _looking_at(pos, pos + np.asarray([1.0, 0.3, 0.2]), np.random.default_rng(0))
     assert np.all(_look(scene, pos, mat)[1] == -1)
 
 
-def test_a_dome_around_the_scene_is_not_drawn() -> None:
+def test_a_dome_around_the_scene_is_not_rendered() -> None:
     scene = scene_of("""
 <mujoco>
   <worldbody>
@@ -205,7 +198,7 @@ def test_an_empty_scene_is_black() -> None:
     assert np.all(np.isposinf(depth))
 
 
-def test_nested_vmap_draws_the_same_frames(arm: Scene) -> None:
+def test_nested_vmap_renders_the_same_frames(arm: Scene) -> None:
     model = arm.mj_model
     xpos, xmat = geom_poses(model, random_qpos(model, 6, seed=9))
     render = make_renderer(arm, size=SIZE, shadows=True)

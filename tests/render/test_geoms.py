@@ -32,6 +32,18 @@ def _model(world: str, assets: str = "") -> str:
             CHECKER + '<material name="m" texture="t"/>',
             ("'mat'", "texture", "'m'"),
         ),
+        (
+            '<flexcomp name="cloth" type="grid" count="3 3 1" spacing="0.1 0.1 0.1" radius="0.01" '
+            'mass="1"/>',
+            "",
+            ("flex 'cloth'",),
+        ),
+        (
+            '<site name="a"/><site name="b" pos="0 0 1"/></worldbody><tendon>'
+            '<spatial name="rope"><site site="a"/><site site="b"/></spatial></tendon><worldbody>',
+            "",
+            ("tendon 'rope'", "group"),
+        ),
     ],
 )
 def test_load_scene_refuses_by_name(
@@ -46,9 +58,21 @@ def test_load_scene_refuses_by_name(
 
 
 @pytest.mark.parametrize("hidden", ['group="3"', 'rgba="1 1 1 0"'])
-def test_what_is_not_drawn_may_be_anything(hidden: str) -> None:
-    world = f'<geom type="mesh" mesh="tetra" {hidden}/>'
+def test_what_is_not_rendered_may_be_anything(hidden: str) -> None:
+    world = (
+        f'<geom type="mesh" mesh="tetra" {hidden}/><site name="a"/><site name="b" pos="0 0 1"/>'
+        f'</worldbody><tendon><spatial {hidden}><site site="a"/><site site="b"/></spatial></tendon>'
+        "<worldbody>"
+    )
     validate_geoms(scene_of(_model(world, TETRAHEDRON)).mj_model)
+
+
+def test_a_geom_that_may_become_visible_is_checked() -> None:
+    model = scene_of(
+        _model('<geom name="g" type="mesh" mesh="tetra" rgba="1 1 1 0"/>', TETRAHEDRON)
+    ).mj_model
+    with pytest.raises(ValueError, match="'g' is of type mesh"):
+        validate_geoms(model, {"geom_rgba": (0,)})
 
 
 def test_the_ids_of_a_byte_are_enough() -> None:
@@ -78,3 +102,22 @@ def test_only_what_is_welded_to_the_world_is_static() -> None:
         )
     ).mj_model
     assert static_geoms(model).tolist() == [True, True, False, False, False]
+
+
+@pytest.mark.parametrize(
+    ("varies", "static"),
+    [
+        ({"geom_pos": (1,)}, [True, False, True, True]),
+        ({"geom_rgba": (0, 2)}, [False, True, False, True]),
+        ({"body_quat": (1,)}, [True, False, False, True]),
+        ({"geom_friction": (0, 1), "body_mass": (1,)}, [True, True, True, True]),
+    ],
+)
+def test_what_varies_by_episode_is_not_static(
+    varies: dict[str, tuple[int, ...]], static: list[bool]
+) -> None:
+    world = (
+        '<geom size="1"/><body><geom size="1"/><body><geom size="1"/></body></body>'
+        '<body><geom size="1"/></body>'
+    )
+    assert static_geoms(scene_of(_model(world)).mj_model, varies).tolist() == static

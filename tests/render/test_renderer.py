@@ -70,11 +70,11 @@ def test_a_renderer_can_be_made_inside_of_a_trace(arm: Scene) -> None:
     data = at(arm.mj_model)
 
     @jax.jit
-    def draw(xpos: jax.Array, xmat: jax.Array) -> jax.Array:
+    def frame(xpos: jax.Array, xmat: jax.Array) -> jax.Array:
         return make_renderer(arm, size=(8, 8))(xpos, xmat)
 
     expected = make_renderer(arm, size=(8, 8))(data.geom_xpos, data.geom_xmat)
-    np.testing.assert_array_equal(draw(data.geom_xpos, data.geom_xmat), expected)
+    np.testing.assert_array_equal(frame(data.geom_xpos, data.geom_xmat), expected)
 
 
 @pytest.mark.skipif(jax.default_backend() != "cpu", reason="concerns XLA's fusion on CPU")
@@ -82,10 +82,10 @@ def test_a_renderer_can_be_made_inside_of_a_trace(arm: Scene) -> None:
 def test_the_ray_cast_is_not_fused_into_its_consumers(arm: Scene, depth: bool) -> None:
     """XLA would repeat it for every channel: 35 times slower, and nothing else would tell."""
     xpos, xmat = geom_poses(arm.mj_model, random_qpos(arm.mj_model, 2, seed=18))
-    draw = jax.vmap(make_renderer(arm, size=(8, 8), depth=depth))
+    frame = jax.vmap(make_renderer(arm, size=(8, 8), depth=depth))
 
     def colours(xpos: jax.Array, xmat: jax.Array) -> jax.Array:
-        image = draw(xpos, xmat)
+        image = frame(xpos, xmat)
         return rgb(image[0] if depth else image)
 
     program = jax.jit(colours).lower(xpos, xmat).compile().as_text()

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import copy
-import dataclasses
-from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -17,11 +15,12 @@ from mujoco_reference import (
     cast_rays,
     geom_poses,
     pixel_rays,
+    random_primitives,
     random_qpos,
     scene_of,
 )
 
-from mjx_arm import Appearance, default_appearance, make_renderer, rgb
+from mjx_arm import make_renderer, rgb
 from mjx_arm.scene import Scene
 
 SIZE = (64, 64)
@@ -34,11 +33,11 @@ MIN_DIFFUSE = 4
 LIFT = 1e-4
 
 
-def _blocked(scene: Scene, data: mujoco.MjData) -> np.ndarray:
-    """Whether a body is between the surface at each pixel and the light, `[H, W] bool`."""
+def _blocked(scene: Scene, data: mujoco.MjData, light: int) -> np.ndarray:
+    """Whether a body is between the surface at each pixel and a light, `[H, W] bool`."""
     model = scene.mj_model
     camera = model.camera("front").id
-    pos, to_light = data.cam_xpos[camera], -data.light_xdir[0]
+    pos, to_light = data.cam_xpos[camera], -data.light_xdir[light]
     directions = pixel_rays(data.cam_xmat[camera], model.cam_fovy[camera], SIZE)
     _, depth, _ = cast_rays(model, data, pos, directions)
     # Planes cast no shadow.
@@ -52,26 +51,49 @@ def _blocked(scene: Scene, data: mujoco.MjData) -> np.ndarray:
     return blocked
 
 
-@pytest.mark.parametrize("name", ["arm", "primitives"])
-def test_shadows_fall_where_the_light_is_blocked(name: str, request: pytest.FixtureRequest) -> None:
+LAMPS = """
+<light type="directional" dir="-0.6 0.5 -1" diffuse="0.4 0.2 0.6" specular="0 0 0"/>
+<light type="directional" dir="0.1 0.7 -1" diffuse="0.2 0.3 0.1" specular="0 0 0"
+       castshadow="false"/>"""
+
+
+@pytest.fixture(scope="module")
+def lamps() -> Scene:
+    return random_primitives(seed=0, count=4, lights=LAMPS)
+
+
+@pytest.mark.parametrize("name", ["arm", "primitives", "lamps"])
+def test_shadows_fall_where_a_light_is_blocked(name: str, request: pytest.FixtureRequest) -> None:
     scene: Scene = request.getfixturevalue(name)
-    qposes = random_qpos(scene.mj_model, POSES, seed=4)
-    poses = geom_poses(scene.mj_model, qposes)
-    own = default_appearance(scene)
-    unlit = dataclasses.replace(own, light_diffuse=jnp.zeros(3, jnp.float32))
+    model = scene.mj_model
+    qposes = random_qpos(model, POSES, seed=4)
+    poses = geom_poses(model, qposes)
+    varies = {"light_diffuse": tuple(range(model.nlight))}
+    # All lights off, and then each light alone.
+    own = np.asarray(model.light_diffuse)
+    alone = np.stack([np.zeros_like(own), *(np.eye(model.nlight)[..., None] * own)])
+    params = {"light_diffuse": jnp.asarray(alone, jnp.float32)}
 
-    def drawing(shadows: bool) -> Callable[[Appearance], np.ndarray]:
-        render = jax.vmap(make_renderer(scene, size=SIZE, shadows=shadows), in_axes=(0, 0, None))
-        return lambda look: np.asarray(rgb(render(*poses, look))).astype(int)
+    def levels(shadows: bool) -> np.ndarray:
+        render = make_renderer(scene, size=SIZE, shadows=shadows, varies=varies)
+        frames = jax.vmap(jax.vmap(render, in_axes=(0, 0, None)), in_axes=(None, None, 0))
+        return np.asarray(rgb(jax.jit(frames)(*poses, params))).astype(int)
 
-    plain = drawing(shadows=False)
-    bright, dark, shadowed = plain(own), plain(unlit), drawing(shadows=True)(own)
-    diffuse = (bright - dark).max(axis=-1)
-    blocked = np.stack([_blocked(scene, at(scene.mj_model, qpos)) for qpos in qposes])
-    expected = np.where((blocked | (diffuse == 0))[..., None], dark, bright)
-    wrong = np.any(expected != shadowed, axis=-1) & (diffuse >= MIN_DIFFUSE)
-    assert blocked.any(axis=(1, 2)).all()
-    assert wrong.mean() <= MAX_MISMATCH
+    plain, shadowed = levels(shadows=False), levels(shadows=True)
+    dark = plain[0]
+    np.testing.assert_array_equal(shadowed[0], dark)
+    states = [at(model, qpos) for qpos in qposes]
+    for light in range(model.nlight):
+        bright = plain[light + 1]
+        if not model.light_castshadow[light]:
+            np.testing.assert_array_equal(shadowed[light + 1], bright)
+            continue
+        diffuse = (bright - dark).max(axis=-1)
+        blocked = np.stack([_blocked(scene, data, light) for data in states])
+        expected = np.where((blocked | (diffuse == 0))[..., None], dark, bright)
+        wrong = np.any(expected != shadowed[light + 1], axis=-1) & (diffuse >= MIN_DIFFUSE)
+        assert blocked.any(axis=(1, 2)).all()
+        assert wrong.mean() <= MAX_MISMATCH
 
 
 LAMP = """
