@@ -350,9 +350,7 @@ def _constant_rotation(quat: Sequence[float]) -> _Matrix:
     return [_vector(row) for row in mat.reshape(3, 3).round(12)]
 
 
-def _vector(values: np.ndarray | jax.Array) -> _Vector:
-    if isinstance(values, jax.Array):
-        return list(values)
+def _vector(values: np.ndarray) -> _Vector:
     return [float(x) for x in values]
 
 
