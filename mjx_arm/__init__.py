@@ -1,10 +1,15 @@
 """Train a robot arm from pixels by deep Q-learning, entirely on the device."""
 
-from mjx_arm.agent import Agent, load_agent
-from mjx_arm.auto_reset import AutoReset
-from mjx_arm.config import PRESETS, EnvConfig, RewardConfig, TrainConfig
-from mjx_arm.env import Env, EnvState, make
-from mjx_arm.loop import make_train
+from typing import TYPE_CHECKING, Any
+
+from mjx_arm.config import TrainConfig, train_config
+from mjx_arm.envs.auto_reset import AutoReset
+from mjx_arm.envs.config import EnvConfig
+from mjx_arm.envs.env import Env, make
+from mjx_arm.envs.state import EnvState, Snapshot
+from mjx_arm.envs.tasks import register
+from mjx_arm.envs.tasks.base import Task, TaskConfig
+from mjx_arm.presets import PRESETS
 from mjx_arm.render import make_renderer, rgb, segmentation
 from mjx_arm.scene import Scene, load_scene
 from mjx_arm.training.agent import Agent, load_agent

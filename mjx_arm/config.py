@@ -7,12 +7,32 @@ import json
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
-from mjx_arm.physics import BACKENDS
+from pydantic import Field
 
-OBSERVATIONS = ("rgb", "rgbd", "segmentation", "state", "packed")
-REWARDS = ("paper", "completion", "progress")
-CUBE_MOVES = ("never", "on_success", "always")
-STARTS = ("home", "in_grasp")
+from mjx_arm.envs.config import EnvConfig, set_env_options
+from mjx_arm.envs.tasks import find_task
+from mjx_arm.options import (
+    MOST,
+    Count,
+    CountOrZero,
+    Discount,
+    NotNegative,
+    Positive,
+    Share,
+    check_name,
+    from_json,
+    options,
+    set_options,
+    to_json,
+)
+
+CONFIG_FORMAT = 2
+# Time steps of an environment that the replay can hold, and steps of a run with its last chunk.
+_MOST_SLOTS = 2**30
+_MOST_STEPS = 2_000_000_000
+_MOST_SEED = 2**31
+
+Widths = tuple[Count, Count, Count]
 
 
 @options
