@@ -23,8 +23,9 @@ from machine import machine
 from mujoco import batch as mj_batch
 
 from mjx_arm.cores import usable_cores
+from mjx_arm.envs.arm import resolve_arm
 from mjx_arm.physics import Physics, make_physics
-from mjx_arm.scene import Scene, load_scene, resolve_task
+from mjx_arm.scene import Scene, load_scene
 
 BATCH_SIZES = (16, 32, 64, 128, 256, 512, 1024)
 # Environment iterations of one measurement: a tenth of a second or so on two cores.
@@ -33,9 +34,9 @@ _ITERATIONS = 8192
 
 def make_backend(physics: Physics, scene: Scene, num_envs: int, length: int) -> Callable[[], None]:
     """Returns a function that runs `length` iterations of the backend in one scan."""
-    ids = resolve_task(scene)
-    qpos = jnp.asarray(np.tile(ids.home_qpos, (num_envs, 1)))
-    ctrl = jnp.asarray(np.tile(ids.home_ctrl, (num_envs, 1)))
+    arm = resolve_arm(scene)
+    qpos = jnp.asarray(np.tile(arm.home_qpos, (num_envs, 1)))
+    ctrl = jnp.asarray(np.tile(arm.home_ctrl, (num_envs, 1)))
     start = jax.vmap(physics.init)(qpos, ctrl)
 
     @jax.jit
@@ -50,14 +51,14 @@ def make_backend(physics: Physics, scene: Scene, num_envs: int, length: int) -> 
 
 def make_loop(physics: Physics, scene: Scene, num_envs: int, length: int) -> Callable[[], None]:
     """Returns a function that runs `length` iterations of the plain loop."""
-    ids = resolve_task(scene)
+    arm = resolve_arm(scene)
     batch = mj_batch.Batch(scene.mj_model, num_envs, nthread=min(num_envs, usable_cores()))
     batch.reset()
-    ctrl = np.tile(ids.home_ctrl, (num_envs, 1))
+    ctrl = np.tile(arm.home_ctrl, (num_envs, 1))
     derived = [batch.bind(name) for name in ("geom_xpos", "geom_xmat", "site_xpos")]
 
     def run() -> None:
-        batch.bind("qpos")[:] = ids.home_qpos
+        batch.bind("qpos")[:] = arm.home_qpos
         batch.bind("qvel")[:] = 0.0
         for _ in range(length):
             batch.ctrl[:] = ctrl
@@ -92,7 +93,7 @@ def main() -> None:
     args = parser.parse_args()
 
     scene = load_scene("arm_cube")
-    physics = make_physics(scene.mj_model, "native", substeps=2)
+    physics = make_physics(scene.mj_model, "native", substeps=scene.substeps)
     rows = []
     print(f"iterations/s of {physics.substeps} substeps: best of {args.repeats}, and median")
     print("   envs          native            loop   native/loop")

@@ -18,7 +18,6 @@ os.environ.setdefault("MUJOCO_GL", "egl")
 
 import argparse
 import copy
-import dataclasses
 import gc
 import json
 import pathlib
@@ -39,19 +38,19 @@ from stable_baselines3 import DQN
 from torch import nn
 
 import mjx_arm
-from mjx_arm.config import TrainConfig
+from mjx_arm.algos.replay import Batch
+from mjx_arm.config import TrainConfig, set_train_options, train_config
 from mjx_arm.cores import usable_cores
 from mjx_arm.interop import ArmCubeEnv
-from mjx_arm.loop import make_body, make_trainer
 from mjx_arm.physics import compiler_options
-from mjx_arm.replay import Batch
-from mjx_arm.scene import resolve_task
+from mjx_arm.training.loop import make_body, make_trainer
 
 _NUM_ENVS = 64
-_SCENE = mjx_arm.load_scene("arm_cube")
-_IDS = resolve_task(_SCENE)
+_ENV = mjx_arm.make("A", physics="native")
+_SCENE, _ARM = _ENV.scene, _ENV.arm
+_CUBE = _SCENE.find("geom", "cube")
 # Physics substeps in one iteration, as in our environment.
-_SUBSTEPS = mjx_arm.make("A", physics="native").physics.substeps
+_SUBSTEPS = _SCENE.substeps
 
 
 class RendererEnv(gymnasium.Env[Any, Any]):
@@ -73,7 +72,7 @@ class RendererEnv(gymnasium.Env[Any, Any]):
         """Starts an episode."""
         super().reset(seed=seed)
         mujoco.mj_resetData(self._model, self._data)
-        self._data.qpos[:], self._data.ctrl[:] = _IDS.home_qpos, _IDS.home_ctrl
+        self._data.qpos[:], self._data.ctrl[:] = _ARM.home_qpos, _ARM.home_ctrl
         mujoco.mj_forward(self._model, self._data)
         self._steps = 0
         return self._image(), {}
@@ -82,14 +81,14 @@ class RendererEnv(gymnasium.Env[Any, Any]):
         """Advances by one iteration."""
         joint, sign = divmod(int(action), 2)
         if joint < 6:
-            self._data.ctrl[_IDS.arm_ctrl[joint]] += np.deg2rad(2 * sign - 1)
+            self._data.ctrl[_ARM.ctrl[joint]] += np.deg2rad(2 * sign - 1)
         else:
-            self._data.ctrl[_IDS.gripper_ctrl] = _IDS.ctrl_range[_IDS.gripper_ctrl, 1 - sign]
-        np.clip(self._data.ctrl, *_IDS.ctrl_range.T, out=self._data.ctrl)
+            self._data.ctrl[_ARM.gripper_ctrl] = _ARM.ctrl_range[_ARM.gripper_ctrl, 1 - sign]
+        np.clip(self._data.ctrl, *_ARM.ctrl_range.T, out=self._data.ctrl)
         mujoco.mj_step(self._model, self._data, _SUBSTEPS)
         mujoco.mj_forward(self._model, self._data)
-        cube = self._data.geom_xpos[_IDS.cube_geom]
-        distance = np.linalg.norm(self._data.site_xpos[_IDS.grasp_site] - cube)
+        cube = self._data.geom_xpos[_CUBE]
+        distance = np.linalg.norm(self._data.site_xpos[_ARM.grasp_site] - cube)
         self._steps += 1
         return self._image(), float(np.exp(-distance)), False, self._steps >= 1000, {}
 
@@ -106,8 +105,10 @@ class TorchNetwork(nn.Module):
 
     def __init__(self, config: TrainConfig):
         super().__init__()
-        layers, channels, edge = [], 3, config.size[0]
-        shapes = zip(config.widths, config.kernels, config.strides, strict=True)
+        layers, channels, edge = [], 3, config.env.size[0]
+        shapes = zip(
+            config.network.widths, config.network.kernels, config.network.strides, strict=True
+        )
         for i, (width, kernel, stride) in enumerate(shapes):
             edge = -(-edge // stride)
             total = max((edge - 1) * stride + kernel - edge * stride, 0)
@@ -117,10 +118,15 @@ class TorchNetwork(nn.Module):
                 layers.append(nn.MaxPool2d(2))
                 edge //= 2
             channels = width
-        self.body = nn.Sequential(*layers, nn.Flatten(), nn.LazyLinear(config.hidden), nn.ReLU())
-        self.value, self.advantage = nn.Linear(config.hidden, 1), nn.Linear(config.hidden, 14)
+        self.body = nn.Sequential(
+            *layers, nn.Flatten(), nn.LazyLinear(config.network.hidden), nn.ReLU()
+        )
+        self.value, self.advantage = (
+            nn.Linear(config.network.hidden, 1),
+            nn.Linear(config.network.hidden, 14),
+        )
         with torch.no_grad():
-            self(torch.zeros(1, *config.size, 3, dtype=torch.uint8))
+            self(torch.zeros(1, *config.env.size, 3, dtype=torch.uint8))
 
     def forward(self, images: torch.Tensor) -> torch.Tensor:
         """Q-values `[B, 14]` of images `[B, H, W, 3] uint8`."""
@@ -152,8 +158,8 @@ def bare_batch() -> Callable[[], float]:
     """Environment steps a second of MuJoCo's thread pool alone."""
     batch = mj_batch.Batch(_SCENE.mj_model, _NUM_ENVS, nthread=usable_cores())
     batch.reset()
-    batch.bind("qpos")[:] = _IDS.home_qpos
-    batch.ctrl[:] = _IDS.home_ctrl
+    batch.bind("qpos")[:] = _ARM.home_qpos
+    batch.ctrl[:] = _ARM.home_ctrl
     return count_per_second(
         lambda: [batch.step(nstep=_SUBSTEPS) for _ in range(300)], 300 * _NUM_ENVS
     )
@@ -182,14 +188,14 @@ def torch_agent(config: TrainConfig) -> tuple[Callable[[], float], Callable[[], 
     """Decisions and updates a second: double DQN, Huber, Adam, clipping, averaged target."""
     online = TorchNetwork(config).to(memory_format=torch.channels_last)
     target = copy.deepcopy(online)
-    adam = torch.optim.Adam(online.parameters(), config.learning_rate)
+    adam = torch.optim.Adam(online.parameters(), config.algo.learning_rate)
     generator = torch.Generator().manual_seed(0)
-    shape = (config.batch_size, *config.size, 3)
+    shape = (config.algo.batch_size, *config.env.size, 3)
     obs, next_obs = (
         torch.randint(0, 256, shape, generator=generator, dtype=torch.uint8) for _ in range(2)
     )
-    action = torch.randint(0, 14, (config.batch_size, 1), generator=generator)
-    reward = torch.zeros(config.batch_size)
+    action = torch.randint(0, 14, (config.algo.batch_size, 1), generator=generator)
+    reward = torch.zeros(config.algo.batch_size)
 
     def act() -> None:
         with torch.inference_mode():
@@ -200,39 +206,39 @@ def torch_agent(config: TrainConfig) -> tuple[Callable[[], float], Callable[[], 
         for _ in range(8):
             with torch.no_grad():
                 best = online(next_obs).argmax(-1, keepdim=True)
-                goal = reward + config.gamma * target(next_obs).gather(1, best)[:, 0]
+                goal = reward + config.algo.gamma * target(next_obs).gather(1, best)[:, 0]
             loss = nn.functional.smooth_l1_loss(online(obs).gather(1, action)[:, 0], goal)
             adam.zero_grad()
             loss.backward()
-            nn.utils.clip_grad_norm_(online.parameters(), config.max_grad_norm)
+            nn.utils.clip_grad_norm_(online.parameters(), config.algo.max_grad_norm)
             adam.step()
             with torch.no_grad():
                 for a, b in zip(target.parameters(), online.parameters(), strict=True):
-                    a.lerp_(b, config.polyak)
+                    a.lerp_(b, config.algo.polyak)
 
     act(), update()
-    return count_per_second(act, 20 * config.batch_size), count_per_second(update, 8)
+    return count_per_second(act, 20 * config.algo.batch_size), count_per_second(update, 8)
 
 
 def our_agent(config: TrainConfig) -> tuple[Callable[[], float], Callable[[], float]]:
     """The same of ours, on pictures that are there already; 8 updates in a scan, as in training."""
     body = make_body(config)
-    key, size = jax.random.key(0), config.batch_size
-    obs, next_obs = jax.random.bits(key, (2, size, *config.size), jnp.uint32)
-    learner = body.dqn.init(key, obs)
+    key, size = jax.random.key(0), config.algo.batch_size
+    obs, next_obs = jax.random.bits(key, (2, size, *config.env.size), jnp.uint32)
+    learner = body.algorithm.q_learning.init(key, obs)
     batch = Batch(
         frame=None,
         next_frame=None,
         action=jax.random.randint(key, (size,), 0, 14),
         reward=jnp.zeros(size),
-        discount=jnp.full(size, config.gamma),
+        discount=jnp.full(size, config.algo.gamma),
         weight=jnp.ones(size),
     )
 
     @jax.jit
     def act(params: Any, obs: jax.Array) -> jax.Array:
         def once(obs: jax.Array, _: None) -> tuple[jax.Array, None]:
-            best = jnp.argmax(body.dqn.apply(params, obs), axis=-1)
+            best = jnp.argmax(body.algorithm.apply(params, obs), axis=-1)
             return obs ^ (best > 99).astype(jnp.uint32)[:, None, None], None
 
         return jax.lax.scan(once, obs, None, length=20)[0]
@@ -242,7 +248,11 @@ def our_agent(config: TrainConfig) -> tuple[Callable[[], float], Callable[[], fl
         # The pictures change places, or their patches would be made once for all updates.
         def once(carry: Any, _: None) -> tuple[Any, None]:
             learner, obs, next_obs = carry
-            return (body.dqn.update(learner, batch, obs, next_obs)[0], next_obs, obs), None
+            return (
+                body.algorithm.q_learning.update(learner, batch, obs, next_obs)[0],
+                next_obs,
+                obs,
+            ), None
 
         return jax.lax.scan(once, (learner, obs, next_obs), None, length=8)[0]
 
@@ -296,7 +306,7 @@ _LIKE_SB3 = {
 
 def make_contestants(names: list[str]) -> dict[str, Callable[[], float]]:
     """What is measured, by name; each call is one measurement."""
-    config = TrainConfig(physics="native", learning_starts=1_000, chunk_steps=8_192)
+    config = train_config(physics="native", learning_starts=1_000, chunk_steps=8_192)
     made: dict[str, Callable[[], float]] = {}
     if "env" in names:
         made["env/gymnasium+Renderer"] = renderer_env(cheap=False)
@@ -312,7 +322,7 @@ def make_contestants(names: list[str]) -> dict[str, Callable[[], float]]:
         made["train/sb3 on mjx_arm"] = sb3(ArmCubeEnv("A", physics="native"), 200)
         made["train/mjx_arm"] = our_training(config)
         made["train/mjx_arm, sb3's ratio and network"] = our_training(
-            dataclasses.replace(config, **_LIKE_SB3)
+            set_train_options(config, _LIKE_SB3)
         )
     return made
 

@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 
 import mjx_arm
-from mjx_arm.scripted import make_scripted_policy
+from mjx_arm.envs.scripted import make_scripted_policy
 
 # Iterations of the scripted policy that are shown.
 MOMENTS = (0, 70, 150)
@@ -38,7 +38,7 @@ def main(folder: pathlib.Path) -> None:
                 ours.append(np.asarray(mjx_arm.rgb(large(poses.geom_xpos, poses.geom_xmat))))
                 data.qpos[:] = state.physics.qpos
                 mujoco.mj_forward(model, data)
-                renderer.update_scene(data, env.config.camera)
+                renderer.update_scene(data, env.config.cameras[0])
                 theirs.append(renderer.render())
             state, _ = step(state, policy(state))
     folder.mkdir(parents=True, exist_ok=True)

@@ -23,10 +23,10 @@ import jax.numpy as jnp
 from machine import machine
 
 import mjx_arm
-from mjx_arm.loop import Body, LoopState, make_body
-from mjx_arm.memory import tree_size
+from mjx_arm.algos.replay import sample
 from mjx_arm.physics import compiler_options
-from mjx_arm.replay import sample
+from mjx_arm.training.loop import Body, LoopState, make_body
+from mjx_arm.training.memory import tree_size
 
 
 def best_of(run: Callable[[], Any], repeats: int) -> float:
@@ -56,16 +56,17 @@ def peaks(repeats: int) -> dict[str, float]:
 def stages(body: Body) -> dict[str, tuple[Callable[[Any], Any], Any]]:
     """Each stage as a function from a carry to the next one, with the first carry."""
     config = body.config
-    env, dqn = body.env, body.dqn
+    env, algorithm = body.env, body.algorithm
+    frames, learning = algorithm.frames, algorithm.q_learning
     state = jax.jit(body.init, compiler_options=compiler_options(env.env.physics))(
         jax.random.key(0)
     )
-    key, size = jax.random.key(1), config.batch_size
+    key, size = jax.random.key(1), config.algo.batch_size
     keys = jax.random.split(key, config.num_envs)
     action = jax.random.randint(key, (config.num_envs,), 0, 14)
     full = state.replay.replace(count=jnp.int32(config.replay_slots))
-    batch = sample(full, key, size, config.n_step, config.gamma)
-    obs, next_obs = body.storage.restore(batch.frame), body.storage.restore(batch.next_frame)
+    batch = sample(full, key, size, config.algo.n_step, config.algo.gamma)
+    obs, next_obs = frames.decode(batch.frame), frames.decode(batch.next_frame)
 
     def render(envs: Any) -> Any:
         drawn = jax.vmap(env.env.observe)(envs.env)
@@ -76,7 +77,7 @@ def stages(body: Body) -> dict[str, tuple[Callable[[Any], Any], Any]]:
         return envs.replace(env=envs.env.replace(physics=physics.replace(poses=poses)))
 
     def act(obs: jax.Array) -> jax.Array:
-        q = dqn.apply(state.learner.params, obs)
+        q = algorithm.apply(state.learner.params, obs)
         return obs ^ (q[:, :1, None] > 1e9).astype(jnp.uint32)
 
     # The pictures change places, or what depends on them alone would be made once for all passes.
@@ -84,32 +85,33 @@ def stages(body: Body) -> dict[str, tuple[Callable[[Any], Any], Any]]:
         params, obs, next_obs = carry
 
         def loss(params: Any) -> jax.Array:
-            return jnp.sum(dqn.apply(params, obs) ** 2)
+            return jnp.sum(algorithm.apply(params, obs) ** 2)
 
         params = jax.tree.map(lambda p, g: p - 1e-9 * g, params, jax.grad(loss)(params))
         return params, next_obs, obs
 
-    def draw_batch(frame: jax.Array) -> jax.Array:
-        drawn = body.storage.restore(frame)
-        return frame + 1e-9 * jnp.sum(drawn & 1, axis=(1, 2)).astype(jnp.float32)[:, None]
+    def render_batch(frame: Any) -> Any:
+        drawn = frames.decode(frame)
+        shift = 1e-9 * jnp.sum(drawn & 1, axis=(1, 2)).astype(jnp.float32)[:, None]
+        return frame | {"qpos": frame["qpos"] + shift}
 
     def update(carry: Any) -> Any:
         learner, obs, next_obs = carry
-        return dqn.update(learner, batch, obs, next_obs)[0], next_obs, obs
+        return learning.update(learner, batch, obs, next_obs)[0], next_obs, obs
 
     def learn(carry: Any) -> Any:
         learner, key = carry
         key, own = jax.random.split(key)
-        return body.learn(own, learner, full)[0], key
+        return algorithm.learn(own, learner, full, jnp.int32(config.replay.replay_size))[0], key
 
-    both = jnp.concatenate([batch.frame, batch.next_frame])
+    both = jax.tree.map(lambda *x: jnp.concatenate(x), batch.frame, batch.next_frame)
     return {
         "physics": (lambda envs: jax.vmap(env.transition)(keys, envs, action)[0], state.envs),
         "render": (render, state.envs),
         "act: forward": (act, state.obs),
-        "learn: draw the batch": (draw_batch, both),
+        "learn: render the batch": (render_batch, both),
         "learn: forward and backward": (gradient, (state.learner.params, obs, next_obs)),
-        "learn: update without drawing": (update, (state.learner, obs, next_obs)),
+        "learn: update without rendering": (update, (state.learner, obs, next_obs)),
         "learn": (learn, (state.learner, key)),
         "whole step": (lambda s: body.step(s, None)[0], state.replace(replay=full)),
     }
@@ -154,13 +156,15 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=7)
     parser.add_argument("--json", type=pathlib.Path, help="file for the figures")
     options = parser.parse_args()
-    config = mjx_arm.TrainConfig()
+    config = mjx_arm.PRESETS["pixels"]
     peak = peaks(options.repeats)
     print(f"{peak['flops_per_s'] / 1e9:.0f} GFLOP/s, {peak['bytes_per_s'] / 1e9:.1f} GB/s")
     print(f"{'stage':<32}{'ms':>8}{'floor':>8}{'MFLOP':>9}{'MB':>9}")
     body = make_body(config)
     flags = compiler_options(body.env.env.physics)
-    in_one = stages(dataclasses.replace(body, dqn=dataclasses.replace(body.dqn, parts=1)))
+    learning = dataclasses.replace(body.algorithm.q_learning, microbatches=1)
+    algorithm = dataclasses.replace(body.algorithm, q_learning=learning)
+    in_one = stages(dataclasses.replace(body, algorithm=algorithm))
     rows = []
     for name, (stage, carry) in stages(body).items():
         row = profile(stage, in_one[name][0], carry, peak, flags, options.repeats)

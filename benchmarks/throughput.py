@@ -37,11 +37,11 @@ from machine import machine
 from matplotlib.figure import Figure
 
 import mjx_arm
-from mjx_arm.config import BACKENDS
-from mjx_arm.loop import make_body, make_trainer
-from mjx_arm.memory import memory_plan, working_memory
-from mjx_arm.parts import in_parts, overwrite_in_parts
-from mjx_arm.physics import compiler_options
+from mjx_arm.config import set_train_options
+from mjx_arm.microbatch import microbatched, overwrite_microbatched
+from mjx_arm.physics import BACKENDS, compiler_options
+from mjx_arm.training.loop import make_body, make_trainer
+from mjx_arm.training.memory import memory_plan, working_memory
 
 _ENV_STAGES = ("physics", "render", "physics+render")
 STAGES = (*_ENV_STAGES, "act", "learn", "train")
@@ -207,7 +207,7 @@ def env_stages(env: mjx_arm.Env, num_envs: int, length: int) -> dict[str, Callab
     def both(carry: Any) -> Any:
         def once(carry: Any, key: jax.Array) -> tuple[Any, None]:
             state = step(carry[0], key)
-            return (state, overwrite_in_parts(jax.vmap(env.observe), state.env, carry[1])), None
+            return (state, overwrite_microbatched(jax.vmap(env.observe), state.env, carry[1])), None
 
         return jax.lax.scan(once, carry, keys)[0]
 
@@ -216,7 +216,7 @@ def env_stages(env: mjx_arm.Env, num_envs: int, length: int) -> dict[str, Callab
 
 def draw(env: mjx_arm.Env, state: Any) -> jax.Array:
     """Images of all environments."""
-    return in_parts(jax.vmap(env.observe))(state.env)
+    return microbatched(jax.vmap(env.observe))(state.env)
 
 
 def agent_stages(config: mjx_arm.TrainConfig, length: int) -> dict[str, Callable[[Any], Any]]:
@@ -225,7 +225,7 @@ def agent_stages(config: mjx_arm.TrainConfig, length: int) -> dict[str, Callable
 
     def act(state: Any) -> Any:
         def once(obs: jax.Array, _: None) -> tuple[jax.Array, None]:
-            q = body.dqn.apply(state.learner.params, obs)
+            q = body.algorithm.apply(state.learner.params, obs)
             # Depends on the result, or the network would be applied once.
             return obs ^ (q[:, :1, None] > 1e9).astype(jnp.uint32), None
 
@@ -234,9 +234,10 @@ def agent_stages(config: mjx_arm.TrainConfig, length: int) -> dict[str, Callable
     def learn(state: Any) -> Any:
         # The ring as if it were full: what is in it does not matter.
         full = dataclasses.replace(state.replay, count=jnp.int32(config.replay_slots))
+        steps = jnp.int32(config.replay.replay_size)
 
         def once(learner: Any, key: jax.Array) -> tuple[Any, None]:
-            return body.learn(key, learner, full)[0], None
+            return body.algorithm.learn(key, learner, full, steps)[0], None
 
         keys = jax.random.split(jax.random.key(2), _learn_calls(config))
         return jax.lax.scan(once, state.learner, keys)[0]
@@ -246,7 +247,7 @@ def agent_stages(config: mjx_arm.TrainConfig, length: int) -> dict[str, Callable
 
 def _learn_calls(config: mjx_arm.TrainConfig) -> int:
     """Steps of learning in a timed chunk; each has `updates_per_step` updates."""
-    return max(1, _UPDATES // config.updates_per_step)
+    return max(1, _UPDATES // config.algo.updates_per_step)
 
 
 def rows(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
@@ -293,7 +294,7 @@ def agent_rows(
     """Rows of the stages of the agent, for both storages where that matters."""
     size, num_envs = common["size"], common["num_envs"]
     for storage in options.storages:
-        config = mjx_arm.TrainConfig(
+        config = mjx_arm.train_config(
             env="B",
             physics=physics,
             size=(size, size),
@@ -305,13 +306,13 @@ def agent_rows(
             learning_starts=0,
             chunk_steps=num_envs * length,
         )
-        # A sample for each step, the default's ratio.
+        # A sample for each step.
         updates = max(1, num_envs // options.batch_size)
-        config = dataclasses.replace(config, updates_per_step=updates)
+        config = set_train_options(config, {"updates_per_step": updates})
         trainer = make_trainer(config)
         flags = compiler_options(trainer.env.physics)
         named = {**describe(trainer.env), **common, "storage": storage}
-        named["batch_size"] = config.batch_size
+        named["batch_size"] = config.algo.batch_size
         if "train" in options.stages:
             training = compile_training(config)
             on_cpu = jax.default_backend() == "cpu"
@@ -321,7 +322,7 @@ def agent_rows(
             state = trainer.init(jax.random.key(0))
             for stage, run in agent_stages(config, length).items():
                 if stage in options.stages and (stage == "learn" or storage == "states"):
-                    updates = _learn_calls(config) * config.updates_per_step
+                    updates = _learn_calls(config) * config.algo.updates_per_step
                     work = updates if stage == "learn" else num_envs * length
                     figures = time_stage(run, state, work, repeats, flags)
                     yield {"stage": stage, **named, **figures}
@@ -341,7 +342,7 @@ def time_training(training: Training, repeats: int) -> dict[str, float]:
     jax.block_until_ready(run())
     figures = time_chunks(run, config.chunk_length * config.num_envs, repeats)
     return {
-        "samples_per_step": config.updates_per_step * config.batch_size / config.num_envs,
+        "samples_per_step": config.samples_per_step,
         **figures,
         "compile_s": training.compile_s,
         "planned_bytes": training.planned_bytes,

@@ -37,11 +37,12 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 
-from mjx_arm.agent import load_config
-from mjx_arm.config import RewardConfig, TrainConfig
-from mjx_arm.evaluate import wilson_interval
+from mjx_arm.config import TrainConfig
 from mjx_arm.interop.sb3 import ArmCubeVecEnv
+from mjx_arm.presets import PRESETS
 from mjx_arm.report.metrics import read_metrics
+from mjx_arm.training.evaluate import wilson_interval
+from mjx_arm.training.run_folder import load_config
 
 _GOAL = 0.9
 _EPSILON = 0.1
@@ -74,7 +75,7 @@ class Extractor(BaseFeaturesExtractor):
     """Our convolutions and first dense layer."""
 
     def __init__(self, space: gymnasium.spaces.Box, config: TrainConfig):
-        super().__init__(space, config.hidden)
+        super().__init__(space, config.network.hidden)
         self.body = TorchNetwork(config).body
 
     def forward(self, images: torch.Tensor) -> torch.Tensor:
@@ -88,19 +89,19 @@ def best_of_ours(config: TrainConfig, total_steps: int) -> DQN:
     return DQN(
         "CnnPolicy",
         envs,
-        learning_rate=config.learning_rate,
-        buffer_size=config.replay_size,
-        learning_starts=config.learning_starts,
-        batch_size=config.batch_size,
-        tau=config.polyak,
-        gamma=config.gamma,
+        learning_rate=config.algo.learning_rate,
+        buffer_size=config.replay.replay_size,
+        learning_starts=config.algo.learning_starts,
+        batch_size=config.algo.batch_size,
+        tau=config.algo.polyak,
+        gamma=config.algo.gamma,
         train_freq=1,
-        gradient_steps=config.updates_per_step,
-        n_steps=config.n_step,
+        gradient_steps=config.algo.updates_per_step,
+        n_steps=config.algo.n_step,
         target_update_interval=1,
-        exploration_fraction=config.epsilon_steps / total_steps,
-        exploration_final_eps=config.epsilon_end,
-        max_grad_norm=config.max_grad_norm,
+        exploration_fraction=config.exploration.epsilon_steps / total_steps,
+        exploration_final_eps=config.exploration.epsilon_end,
+        max_grad_norm=config.algo.max_grad_norm,
         policy_kwargs={
             "features_extractor_class": Extractor,
             "features_extractor_kwargs": {"config": config},
@@ -127,9 +128,10 @@ LEARNERS: dict[str, tuple[Callable[[TrainConfig, int], DQN], bool]] = {
 
 def make_envs(config: TrainConfig, num_envs: int, **changes: Any) -> ArmCubeVecEnv:
     """Our environments with the reward and the length of episodes of a run."""
-    reward = RewardConfig(kind=config.reward, scale=config.reward_scale, discount=config.gamma)
-    options = {"reward": reward, "max_steps": config.max_steps, "size": config.size} | changes
-    return ArmCubeVecEnv(config.env, num_envs, physics="native", **options)
+    env = config.env
+    options = {"reward": env.reward, "reward_scale": env.reward_scale}
+    options |= {"max_steps": env.max_steps, "size": env.size} | changes
+    return ArmCubeVecEnv(env.env, num_envs, physics="native", **options)
 
 
 class Judge:
@@ -303,7 +305,7 @@ def main() -> None:
 
     try:
         ours = read().get("mjx_arm")
-        config = TrainConfig() if options.run is None else load_config(options.run)
+        config = PRESETS["pixels"] if options.run is None else load_config(options.run)
     except ValueError as error:
         parser.error(str(error))
     if ours is None:
