@@ -19,14 +19,16 @@ def main() -> None:
         act_key, env_key = jax.random.split(key)
         actions = jax.random.randint(act_key, (NUM_ENVS,), 0, env.num_actions)
         keys = jax.random.split(env_key, NUM_ENVS)
-        obs, state, reward, terminated, truncated, info = jax.vmap(auto.step)(keys, state, actions)
+        obs, state, reward, *_, info = jax.vmap(auto.step)(keys, state, actions)
         return (obs, state), (reward.mean(), info["distance"].mean(), info["grasped"].mean())
 
     @jax.jit
     def run(key):
         reset_key, key = jax.random.split(key)
         start = jax.vmap(auto.reset)(jax.random.split(reset_key, NUM_ENVS))
-        (obs, _), (reward, distance, grasped) = jax.lax.scan(step, start, jax.random.split(key, 200))
+        (obs, _), (reward, distance, grasped) = jax.lax.scan(
+            step, start, jax.random.split(key, 200)
+        )
         return obs, reward, distance, grasped
 
     obs, reward, distance, grasped = run(jax.random.key(0))

@@ -1,9 +1,11 @@
 """A task of one's own: raise the grasp site. Registered, it works everywhere by its name.
 
-Also from the command line: `mjx-arm train --task own_task:raise_hand`.
+On the command line: `mjx-arm train --task own_task:raise_hand --reward height`.
 """
 
 from __future__ import annotations
+
+from types import MappingProxyType
 
 import jax
 import jax.numpy as jnp
@@ -14,9 +16,7 @@ import mjx_arm
 class RaiseHand:
     """The grasp site is to be 50 cm above the table. It has the members of `mjx_arm.Task`."""
 
-    varies = {}  # no field of the model varies by episode
-    obstacles = ()
-    feature_scales = (5.0,)
+    varies, obstacles, feature_scales = MappingProxyType({}), (), (5.0,)
 
     def __init__(self, config, scene, arm):
         self.arm = arm

@@ -1,4 +1,4 @@
-"""Two cameras in one observation, one of them on the wrist: a scene of one's own by MuJoCo's spec."""
+"""Two cameras in one observation, one of them on the wrist, added to the scene by MjSpec."""
 
 from __future__ import annotations
 
