@@ -5,8 +5,6 @@ On the command line: `mjx-arm train --task own_task:raise_hand --reward height`.
 
 from __future__ import annotations
 
-from types import MappingProxyType
-
 import jax
 import jax.numpy as jnp
 
@@ -16,10 +14,8 @@ import mjx_arm
 class RaiseHand:
     """The grasp site is to be 50 cm above the table. It has the members of `mjx_arm.Task`."""
 
-    varies, obstacles, feature_scales = MappingProxyType({}), (), (5.0,)
-
     def __init__(self, config, scene, arm):
-        self.arm = arm
+        self.arm, self.varies, self.obstacles, self.feature_scales = arm, {}, (), (5.0,)
         self.rewards = {"height": self.reward}
 
     def fixed_placement(self):
