@@ -1,0 +1,1 @@
+"""Environments: what a robot can do in a scene, and what a task asks of it."""
