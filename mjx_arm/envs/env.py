@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_arm.envs.arm import Arm, apply_action, arm_feature_scales, arm_features, resolve_arm
-from mjx_arm.envs.collision import Clearance, make_clearance
+from mjx_arm.envs.collision import Collision, make_self_collision
 from mjx_arm.envs.config import EnvConfig, env_config
 from mjx_arm.envs.starts import StartSampler
 from mjx_arm.envs.state import EnvState, Observation, Placement, Snapshot, Transition
@@ -44,7 +44,8 @@ class Env:
       reward: computes the terms of the reward.
       physics: the backend's functions.
       starts: samples the starts of episodes.
-      clearance: whether the arm is free of itself, its base and the ground.
+      collision: whether the arm is free of itself, its base and the ground.
+      kinematics: poses of a `qpos` and params.
       varies: which rows of the model's fields vary by episode.
       cameras: renders the image of each camera.
     """
@@ -56,7 +57,8 @@ class Env:
     reward: Reward
     physics: Physics
     starts: StartSampler
-    clearance: Clearance
+    collision: Collision
+    kinematics: Callable[..., Poses]
     varies: Varies
     cameras: tuple[Camera, ...]
 
@@ -111,8 +113,9 @@ class Env:
 
         Returns:
           observation, state, reward, terminated, truncated and info. `info` has the task's metrics
-          (for `lift`: `grasped`, `height`, `distance`), `success`, `diverged` and `blocked`, and
-          the terms of the reward, `reward_*`.
+          (for `lift`: `grasped`, `height`, `distance`), `success`, `diverged`, `blocked` (the action
+          was not carried out, because the arm would touch itself, its base or the ground), and the
+          terms of the reward, `reward_*`.
 
         Raises:
           ValueError: the action is known when called, and is not one of the actions.
@@ -136,7 +139,7 @@ class Env:
         wanted = apply_action(
             self.arm, state.ctrl, action, config.degrees_per_action, config.millimetres_per_action
         )
-        blocked = self.clearance.blocks(state.physics.qpos, state.ctrl, wanted)
+        blocked = self._is_blocked(state, wanted)
         ctrl = jnp.where(blocked, state.ctrl, wanted)
         physics = self.physics.step(state.physics, ctrl, state.params)
         after = dataclasses.replace(state, physics=physics, ctrl=ctrl, step=state.step + 1)
@@ -216,6 +219,13 @@ class Env:
             start_samples=samples,
         )
 
+    def _is_blocked(self, state: EnvState, ctrl: jax.Array) -> jax.Array:
+        """Whether a command would take the arm into itself, its base or the ground: `[] bool`."""
+        arm = self.arm
+        qpos = state.physics.qpos.at[arm.qpos].set(ctrl[arm.ctrl])
+        commanded = self.kinematics(qpos, state.params)
+        return self.collision.is_blocked(state.physics.poses, commanded)
+
     def _check_action(self, action: jax.Array | int) -> None:
         if isinstance(action, jax.core.Tracer):
             return
@@ -261,7 +271,8 @@ def make_env(config: EnvConfig, *, reward: Reward | None = None) -> Env:
     task = find_task(config.task).make(config.task_options, scene, arm)
     model, varies = scene.mj_model, task.varies
     check_varies(model, varies)
-    clearance = make_clearance(model, arm)
+    kinematics = make_kinematics(model, varies)
+    around = make_self_collision(model, obstacles=task.obstacles, home=arm.home_qpos)
     return Env(
         config=config,
         scene=scene,
@@ -275,8 +286,9 @@ def make_env(config: EnvConfig, *, reward: Reward | None = None) -> Env:
             mjx_iterations=scene.mjx_iterations,
             varies=varies,
         ),
-        starts=StartSampler(arm, task, clearance, make_kinematics(model, varies), config),
-        clearance=clearance,
+        starts=StartSampler(arm, task, around, kinematics, config),
+        collision=make_self_collision(model, home=arm.home_qpos),
+        kinematics=kinematics,
         varies=varies,
         cameras=tuple(_make_camera(scene, name, config, varies) for name in config.cameras),
     )

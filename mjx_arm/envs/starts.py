@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_arm.envs.arm import Arm
-from mjx_arm.envs.collision import Clearance
+from mjx_arm.envs.collision import Collision
 from mjx_arm.envs.config import EnvConfig
 from mjx_arm.envs.state import Placement
 from mjx_arm.envs.tasks.base import Task
@@ -33,14 +33,14 @@ class StartSampler:
     Attributes:
       arm: the arm.
       task: puts its objects.
-      clearance: whether the arm is free.
+      collision: whether the arm is free of itself, its base, the ground and the task's objects.
       kinematics: poses of a `qpos`.
       config: how joints and objects vary.
     """
 
     arm: Arm
     task: Task
-    clearance: Clearance
+    collision: Collision
     kinematics: Callable[[jax.Array, Params], Poses]
     config: EnvConfig
 
@@ -85,8 +85,7 @@ class StartSampler:
     def _is_free(self, joints: jax.Array, placement: Placement) -> jax.Array:
         qpos, _, params = self._assemble(joints, placement)
         poses = self.kinematics(qpos, params)
-        free = self.clearance.is_free(poses, self.task.obstacles)
-        return free & self.task.accepts(poses, placement)
+        return self.collision.is_free(poses) & self.task.accepts(poses, placement)
 
     def _assemble(
         self, joints: jax.Array, placement: Placement

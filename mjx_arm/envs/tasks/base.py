@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from typing import Protocol
 
@@ -10,6 +9,7 @@ import jax
 import numpy as np
 
 from mjx_arm.envs.arm import Arm
+from mjx_arm.envs.collision import Obstacle
 from mjx_arm.envs.state import EnvState, Placement, Snapshot
 from mjx_arm.kinematics import Poses
 from mjx_arm.options import options
@@ -23,19 +23,6 @@ Reward = Callable[[Snapshot, Snapshot, jax.Array], dict[str, jax.Array]]
 @options
 class TaskConfig:
     """Options of a task; a task's own class derives from this one."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Obstacle:
-    """A sphere that a starting arm keeps clear of.
-
-    Attributes:
-      geom: geom id of its centre.
-      radius: m.
-    """
-
-    geom: int
-    radius: float
 
 
 class Task(Protocol):

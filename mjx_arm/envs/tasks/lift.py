@@ -13,8 +13,9 @@ import numpy as np
 from jax.scipy.spatial.transform import Rotation
 
 from mjx_arm.envs.arm import Arm
+from mjx_arm.envs.collision import Obstacle
 from mjx_arm.envs.state import EnvState, Snapshot
-from mjx_arm.envs.tasks.base import Obstacle, Reward, TaskConfig, rectangle
+from mjx_arm.envs.tasks.base import Reward, TaskConfig, rectangle
 from mjx_arm.kinematics import Poses, make_kinematics
 from mjx_arm.options import Positive, options
 from mjx_arm.scene import Scene
