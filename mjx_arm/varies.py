@@ -20,7 +20,7 @@ Varies: TypeAlias = Mapping[str, tuple[int, ...]]
 """Name of a float array of MjModel, or of the headlight -> the ids of its rows that vary."""
 
 Params: TypeAlias = dict[str, jax.Array]
-"""The same names -> the values of those rows, `[len(ids), ...] float32`, in the order of the ids."""
+"""The same names -> the values of those rows, `[len(ids), ...] float32`, in the ids' order."""
 
 # The headlight has no row in an array of MjModel. Each of its colours is an array of one row here.
 _HEADLIGHT = {"headlight_ambient": "ambient", "headlight_diffuse": "diffuse"}
@@ -139,9 +139,9 @@ def replace_rows(array: np.ndarray, ids: tuple[int, ...], values: jax.Array) -> 
 def _values(mj_model: mujoco.MjModel, field: str) -> np.ndarray:
     if field in _HEADLIGHT:
         return np.asarray(getattr(mj_model.vis.headlight, _HEADLIGHT[field]))[None]
-    values = getattr(mj_model, field, None) if isinstance(field, str) else None
+    values = getattr(mj_model, field, None)
     if not isinstance(values, np.ndarray) or not np.issubdtype(values.dtype, np.floating):
-        near = difflib.get_close_matches(str(field), _float_fields(mj_model), n=1)
+        near = difflib.get_close_matches(field, _float_fields(mj_model), n=1)
         hint = f"; did you mean {near[0]!r}?" if near else ""
         raise ValueError(f"{field!r} is not a float array of MjModel{hint}")
     return values
