@@ -244,8 +244,8 @@ class _Cores:
         if not self.disc.any():
             return near
         squared = jnp.square(point[0]) + jnp.square(point[1])
-        scale = self.disc * jax.lax.rsqrt(squared + np.float32(1e-12))
-        scale = jnp.where(scale < 1, scale, np.float32(1.0))
+        ratio = self.disc * jax.lax.rsqrt(jnp.asarray(squared + np.float32(1e-12)))
+        scale = jnp.where(ratio < 1, ratio, np.float32(1.0))
         round_ = [
             jnp.where(self.disc > 0, x * scale, n) for x, n in zip(point[:2], near[:2], strict=True)
         ]
