@@ -1,4 +1,27 @@
-"""Starting points of the command line."""
+"""Starting points of the command line.
+
+The preset `paper` has every value that James & Johns 2016 state, with these deviations:
+
+=============  =============================  =====================================================
+thing          paper                          preset `paper`, and why
+=============  =============================  =====================================================
+epsilon        annealed over 1 million        over 1 million environment steps: the paper shows
+               episodes                       success from episode 1,800 on, so it counts iterations
+environments   one                            32 side by side with one replay of 500,000: speed
+updates        not stated                     one of 64 transitions per step of all 32: speed; this
+                                              samples two transitions for each environment step
+squared error  (q - y)^2                      (q - y)^2 / 2: Adam's step is the same
+starts in B    joints varied by 20 degrees    sampled again while the arm would touch itself, the
+                                              table or the cube: such a start cannot exist
+commands       always carried out             blocked where the arm would touch itself, its base or
+                                              the table: a real arm cannot go there
+evaluation     50 episodes                    1,000, each with a new place for the cube: a narrower
+                                              interval
+=============  =============================  =====================================================
+
+Not stated in the paper, and so our choice: image size (64 by 64), sizes of the network, batch size,
+target period, units of distance (0.1 m) and height (1 m) in the reward, arm (ViperX 300), camera.
+"""
 
 from __future__ import annotations
 

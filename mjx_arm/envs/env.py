@@ -112,10 +112,10 @@ class Env:
           action: `[] int32`, 0 to `num_actions - 1`.
 
         Returns:
-          observation, state, reward, terminated, truncated and info. `info` has the task's metrics
-          (for `lift`: `grasped`, `height`, `distance`), `success`, `diverged`, `blocked` (the action
-          was not carried out, because the arm would touch itself, its base or the ground), and the
-          terms of the reward, `reward_*`.
+          observation, state, reward, terminated, truncated and info. `info` has the task's
+          metrics (for `lift`: `grasped`, `height`, `distance`), `success`, `diverged`, `blocked`
+          (the action was not carried out, because the arm would touch itself, its base or the
+          ground), and the terms of the reward, `reward_*`.
 
         Raises:
           ValueError: the action is known when called, and is not one of the actions.

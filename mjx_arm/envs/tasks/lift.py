@@ -90,7 +90,7 @@ class Lift:
         self._kinematics = make_kinematics(model)
         self.varies: Varies = {}
         self.rewards: Mapping[str, Reward] = {
-            "paper": functools.partial(paper_reward, config),
+            "paper": functools.partial(paper_reward, config, self.half_size),
             "completion": functools.partial(completion_reward, config),
         }
         self.feature_scales = (*[5.0] * 3, *[1.0] * 4, *[10.0] * 3)
@@ -185,11 +185,11 @@ def grasped(task: Lift, poses: Poses, ctrl: jax.Array) -> jax.Array:
 
 
 def paper_reward(
-    config: LiftConfig, before: Snapshot, after: Snapshot, action: jax.Array
+    config: LiftConfig, half_size: float, before: Snapshot, after: Snapshot, action: jax.Array
 ) -> dict[str, jax.Array]:
-    """Algorithm 1 of James & Johns 2016; see `LiftConfig`."""
+    """Algorithm 1 of James & Johns 2016; see `LiftConfig`. Its height is the cube's centre's."""
     del before, action
-    height = after.measured["height"]
+    height = after.measured["height"] + np.float32(half_size)
     distance = after.measured["distance"] / config.distance_unit
     return _terms(
         config,
