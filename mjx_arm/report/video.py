@@ -11,6 +11,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from PIL import Image, ImageDraw, ImageFont
 
 from mjx_arm.algos.collect import act
 from mjx_arm.algos.exploration import check_epsilon
@@ -23,6 +24,7 @@ from mjx_arm.varies import Params
 
 _EDGE = 384
 _FRAMES_PER_SECOND = 30
+_FONT_SIZE = 15
 # Frames rendered in one call.
 _AT_ONCE = 50
 
@@ -93,8 +95,11 @@ def record_episode(
 def draw_episode(env: Env, episode: Episode) -> Iterator[np.ndarray]:
     """Renders an episode: the scene with shadows, and beside it what the agent sees.
 
+    Labels name both sides, the step, the largest Q-value and, at the end, the result.
+
     Yields:
-      Each of its frames, `[384, 768, 3] uint8`; rendered some at a time, for 1,000 are a gigabyte.
+      Each of its frames, `[384, 768, 3] uint8`. Some are rendered at a time, because 1,000 would
+      take a gigabyte.
     """
     kinematics = make_kinematics(env.scene.mj_model, env.varies)
     size = (_EDGE, _EDGE)
@@ -113,8 +118,28 @@ def draw_episode(env: Env, episode: Episode) -> Iterator[np.ndarray]:
         # Of one length, or the last ones would compile again.
         padded = np.concatenate([qpos, np.repeat(qpos[-1:], _AT_ONCE - len(qpos), axis=0)])
         scenes, views = jax.device_get(render_some(padded))
-        for scene, view in zip(scenes[: len(qpos)], views, strict=False):
-            yield np.concatenate([scene, view[rows][:, columns]], axis=1)
+        for i, (scene, view) in enumerate(zip(scenes[: len(qpos)], views, strict=False)):
+            frame = np.concatenate([scene, view[rows][:, columns]], axis=1)
+            yield _label(frame, env, episode, start + i)
+
+
+def _label(frame: np.ndarray, env: Env, episode: Episode, step: int) -> np.ndarray:
+    """The frame with its labels."""
+    height, width = env.config.size
+    status = f"step {step}   max Q {episode.max_q[step]:.2f}"
+    if step == len(episode) - 1:
+        status += "   success" if episode.success else "   failed"
+    image = Image.fromarray(frame)
+    draw = ImageDraw.Draw(image)
+    font = ImageFont.load_default(_FONT_SIZE)
+    labels = (
+        ((6, 4), "scene"),
+        ((_EDGE + 6, 4), f"what the agent sees, {width}×{height} pixels"),
+        ((6, _EDGE - _FONT_SIZE - 8), status),
+    )
+    for place, text in labels:
+        draw.text(place, text, fill="white", stroke_width=2, stroke_fill="black", font=font)
+    return np.asarray(image)
 
 
 def _first_camera(image: jax.Array, env: Env) -> jax.Array:
