@@ -142,10 +142,13 @@ def _draw_panel(
             x, y = _known(run, x_name, panel.dots[0])
             label = panel.dots[1] if run is runs[0] and x.size else None
             axes.plot(x, y, color=colour, ls="", marker="D", ms=3.5, mec="black", label=label)
+            empty &= x.size == 0
     if len(runs) > 1:
         _draw_spread(axes, panel.column, x_name, runs)
     if empty:
         axes.text(0.5, 0.5, _why_empty(panel), transform=axes.transAxes, ha="center", va="center")
+    if panel.unit.startswith("share"):
+        axes.set_ylim(-0.03, 1.03)
     axes.set_title(panel.title, fontsize=10)
     axes.set_xlabel(_X_LABELS[x_name])
     axes.set_ylabel(panel.unit)

@@ -134,7 +134,7 @@ def _label(frame: np.ndarray, env: Env, episode: Episode, step: int) -> np.ndarr
     font = ImageFont.load_default(_FONT_SIZE)
     labels = (
         ((6, 4), "scene"),
-        ((_EDGE + 6, 4), f"what the agent sees, {width}×{height} pixels"),
+        ((_EDGE + 6, 4), f"what the agent sees, {width} by {height} pixels"),
         ((6, _EDGE - _FONT_SIZE - 8), status),
     )
     for place, text in labels:
