@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import argparse
 import copy
+import functools
 import json
 import pathlib
 import statistics
@@ -186,7 +187,9 @@ def curve(scene: str, options: argparse.Namespace) -> list[dict[str, Any]]:
                 "median": float(np.median(difference)),
                 "p90": float(np.quantile(difference, 0.9)),
                 "p99": float(np.quantile(difference, 0.99)),
-                "steps_per_s": round(rate(lambda: step(start, ctrl).qpos, count, options.repeats)),
+                "steps_per_s": round(
+                    rate(functools.partial(step, start, ctrl), count, options.repeats)
+                ),
             }
             print(json.dumps(row), flush=True)
             rows.append(row)

@@ -246,7 +246,9 @@ class _Cores:
         squared = jnp.square(point[0]) + jnp.square(point[1])
         scale = self.disc * jax.lax.rsqrt(squared + np.float32(1e-12))
         scale = jnp.where(scale < 1, scale, np.float32(1.0))
-        round_ = [jnp.where(self.disc > 0, x * scale, n) for x, n in zip(point[:2], near[:2], strict=True)]
+        round_ = [
+            jnp.where(self.disc > 0, x * scale, n) for x, n in zip(point[:2], near[:2], strict=True)
+        ]
         return [*round_, near[2]]
 
 

@@ -21,7 +21,7 @@ from mjx_arm.physics.base import Physics, PhysicsState
 
 # MuJoCo's own bound (mjMAXVAL) above which it calls a simulation unstable.
 _MAX_VALUE = 1e10
-# For the 17 that the scene's pairs allow, in 16,384 environments: 80 MB. What is over is dropped.
+# For 17 in 16,384 environments, where rollouts had 10 at most: 80 MB. What is over is dropped.
 _WARP_CONTACTS = 17 * 16_384
 
 
