@@ -14,7 +14,7 @@ alternating rounds.
 from __future__ import annotations
 
 import argparse
-import copy
+import functools
 import json
 import pathlib
 import statistics
@@ -29,11 +29,8 @@ import numpy as np
 from machine import machine
 
 import mjx_arm
-from mjx_arm.physics import PhysicsState, compiler_options
-from mjx_arm.physics.mjx import make_mjx
-from mjx_arm.physics.native import make_native
-from mjx_arm.scripted import make_scripted_policy
-from mjx_arm.task import CLOSE, NUM_ACTIONS, OPEN
+from mjx_arm.envs.scripted import make_scripted_policy
+from mjx_arm.physics import PhysicsState, compiler_options, make_physics
 
 # Of a cube at rest on the table.
 RESTING_CONTACTS = 4
@@ -44,20 +41,21 @@ EVERY = 12
 Policy = Callable[[jax.Array, Any], jax.Array]
 
 
-def random_policy(key: jax.Array, state: Any) -> jax.Array:
+def make_random_policy(env: mjx_arm.Env) -> Policy:
     """A random action."""
-    del state
-    return jax.random.randint(key, (), 0, NUM_ACTIONS)
+    return lambda key, state: jax.random.randint(key, (), 0, env.num_actions)
 
 
-def make_pushing_policy(scripted: Callable[[Any], jax.Array]) -> Policy:
+def make_pushing_policy(env: mjx_arm.Env) -> Policy:
     """Goes for the cube, but opens, closes and turns at random on the way."""
+    scripted = make_scripted_policy(env)
+    open_, close = env.arm.open_action, env.arm.close_action
 
     def policy(key: jax.Array, state: Any) -> jax.Array:
         choose, which = jax.random.split(key)
         draw = jax.random.uniform(choose)
-        gripper = jax.random.choice(which, jnp.asarray([OPEN, CLOSE, CLOSE], jnp.int32))
-        turn = jax.random.randint(which, (), 0, OPEN)
+        gripper = jax.random.choice(which, jnp.asarray([open_, close, close], jnp.int32))
+        turn = jax.random.randint(which, (), 0, open_)
         return jnp.where(draw < 0.05, gripper, jnp.where(draw < 0.4, turn, scripted(state)))
 
     return policy
@@ -100,12 +98,12 @@ def contact_counts(model: mujoco.MjModel, qpos: np.ndarray) -> np.ndarray:
 
 def contact_states(scene: str, num_envs: int, most: int) -> dict[str, np.ndarray]:
     """At most `most` states that are rich in contacts, evenly from all rollouts."""
-    env = mjx_arm.make("B", physics="native", observation="state", cube_moves="always", scene=scene)
+    env = mjx_arm.make("B", physics="native", observation="state", placement="always", scene=scene)
     held = mjx_arm.make("B", physics="native", observation="state", start="in_grasp", scene=scene)
     cases = (
-        (env, make_pushing_policy(make_scripted_policy(env))),
-        (env, random_policy),
-        (held, random_policy),
+        (env, make_pushing_policy(env)),
+        (env, make_random_policy(env)),
+        (held, make_random_policy(held)),
     )
     parts = [rollout(used, policy, num_envs, seed) for seed, (used, policy) in enumerate(cases)]
     states = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
@@ -128,9 +126,8 @@ def after_native(model: mujoco.MjModel, states: dict[str, np.ndarray]) -> np.nda
 
 def mjx_step(model: mujoco.MjModel, iterations: int, line_search: int) -> Any:
     """MJX's physics with so many solver and line search iterations, and its jit options."""
-    told = copy.copy(model)
-    told.opt.iterations, told.opt.ls_iterations = iterations, line_search
-    physics = make_mjx(told, SUBSTEPS)
+    counts = iterations, line_search
+    physics = make_physics(model, "mjx", substeps=SUBSTEPS, mjx_iterations=counts)
     return physics, compiler_options(physics)
 
 
@@ -186,7 +183,9 @@ def curve(scene: str, options: argparse.Namespace) -> list[dict[str, Any]]:
                 "median": float(np.median(difference)),
                 "p90": float(np.quantile(difference, 0.9)),
                 "p99": float(np.quantile(difference, 0.99)),
-                "steps_per_s": round(rate(lambda: step(start, ctrl).qpos, count, options.repeats)),
+                "steps_per_s": round(
+                    rate(functools.partial(step, start, ctrl), count, options.repeats)
+                ),
             }
             print(json.dumps(row), flush=True)
             rows.append(row)
@@ -203,10 +202,9 @@ def ratios(options: argparse.Namespace) -> list[dict[str, Any]]:
             loaded = mjx_arm.load_scene(scene)
             states = contact_states(scene, options.num_envs, options.speed_envs)
             if backend == "native":
-                physics, flags = make_native(loaded.mj_model, SUBSTEPS), {}
+                physics, flags = make_physics(loaded.mj_model, "native", substeps=SUBSTEPS), {}
             else:
-                counts = mjx_arm.scene.resolve_task(loaded).mjx_iterations
-                physics, flags = mjx_step(loaded.mj_model, int(counts[0]), int(counts[1]))
+                physics, flags = mjx_step(loaded.mj_model, *loaded.mjx_iterations)
             runs.append(stepping(physics, flags, states, length))
             works.append(len(states["qpos"]) * length)
         rounds = [

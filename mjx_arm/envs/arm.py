@@ -70,6 +70,15 @@ class Arm:
         """The action that closes the gripper."""
         return 2 * self.num_joints + 1
 
+    def commanded(self, qpos: jax.Array, ctrl: jax.Array) -> jax.Array:
+        """`qpos [nq] float32` with the arm's joints where their commands would have them."""
+        # A select of gathered commands: XLA on CPU runs a scatter as a loop.
+        source = np.zeros(qpos.shape, int)
+        source[self.qpos] = self.ctrl
+        mask = np.zeros(qpos.shape, bool)
+        mask[self.qpos] = True
+        return jnp.where(mask, ctrl[source], qpos)
+
 
 def resolve_arm(scene: Scene) -> Arm:
     """Finds the arm in a scene: every actuator but `gripper` is a servo of one of its joints.

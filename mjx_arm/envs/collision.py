@@ -164,8 +164,8 @@ def _make_clearances(
     @jax.custom_batching.custom_vmap
     def many(xpos: jax.Array, xmat: jax.Array) -> jax.Array:
         """`[N, ngeom, 3]` and `[N, ngeom, 3, 3]` to `[N, P]`."""
-        pos = _computed_once(jnp.transpose(_computed_once(xpos)[:, used], (2, 1, 0)))
-        mat = _computed_once(jnp.transpose(_computed_once(xmat)[:, used], (2, 3, 1, 0)))
+        pos = _computed_once(jnp.transpose(xpos, (2, 1, 0))[:, used])
+        mat = _computed_once(jnp.transpose(xmat, (2, 3, 1, 0))[:, :, used])
         one, other = (
             _Cores.of(cores[:, side], pos[:, which], mat[:, :, which])
             for side, which in enumerate((first, second))

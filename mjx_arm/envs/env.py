@@ -221,9 +221,7 @@ class Env:
 
     def _is_blocked(self, state: EnvState, ctrl: jax.Array) -> jax.Array:
         """Whether a command would take the arm into itself, its base or the ground: `[] bool`."""
-        arm = self.arm
-        qpos = state.physics.qpos.at[arm.qpos].set(ctrl[arm.ctrl])
-        commanded = self.kinematics(qpos, state.params)
+        commanded = self.kinematics(self.arm.commanded(state.physics.qpos, ctrl), state.params)
         return self.collision.is_blocked(state.physics.poses, commanded)
 
     def _check_action(self, action: jax.Array | int) -> None:
