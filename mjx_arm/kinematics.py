@@ -61,7 +61,11 @@ class CameraPose(Protocol):
         ...
 
 
-def make_kinematics(mj_model: mujoco.MjModel, varies: Varies | None = None) -> Kinematics:
+def make_kinematics(
+    mj_model: mujoco.MjModel,
+    varies: Varies | None = None,
+    geoms: Sequence[int] | None = None,
+) -> Kinematics:
     """Makes `kinematics(qpos, params={})`, MuJoCo's `mj_kinematics` in pure JAX.
 
     A quaternion need not have unit length; a zero quaternion is the identity, as in MuJoCo.
@@ -70,6 +74,8 @@ def make_kinematics(mj_model: mujoco.MjModel, varies: Varies | None = None) -> K
       mj_model: a model with free, hinge and slide joints, and without mocap bodies.
       varies: which rows of the model vary by episode. Of these the function reads `geom_pos`,
         `geom_quat`, `body_pos` and `body_quat` from its `params`.
+      geoms: ids of the geoms whose poses are wanted, in this order, and no sites; None for all
+        geoms and sites.
 
     Returns:
       A pure function from `qpos [nq] float32` and `Params` to `Poses`.
@@ -81,19 +87,21 @@ def make_kinematics(mj_model: mujoco.MjModel, varies: Varies | None = None) -> K
     """
     _check_bodies(mj_model, range(mj_model.nbody))
     _check_varies(mj_model, varies)
+    ids = range(mj_model.ngeom) if geoms is None else [int(geom) for geom in geoms]
+    site_ids = range(mj_model.nsite) if geoms is None else range(0)
 
     def kinematics(qpos: jax.Array, params: Params | None = None) -> Poses:
         check_params(mj_model, varies, params)
         read = _make_read(mj_model, varies, params)
         frames = _body_frames(mj_model, range(mj_model.nbody), qpos, read)
-        geoms = [frames[body] for body in mj_model.geom_bodyid]
-        sites = [frames[body] for body in mj_model.site_bodyid]
-        geom_xpos = [_transform(*frame, read("geom_pos", i)) for i, frame in enumerate(geoms)]
+        of_geom = {i: frames[mj_model.geom_bodyid[i]] for i in ids}
+        of_site = {i: frames[mj_model.site_bodyid[i]] for i in site_ids}
+        geom_xpos = [_transform(*frame, read("geom_pos", i)) for i, frame in of_geom.items()]
         geom_xmat = [
             _multiply(rotation, _rotation(read("geom_quat", i)))
-            for i, (_, rotation) in enumerate(geoms)
+            for i, (_, rotation) in of_geom.items()
         ]
-        site_xpos = [_transform(*frame, read("site_pos", i)) for i, frame in enumerate(sites)]
+        site_xpos = [_transform(*frame, read("site_pos", i)) for i, frame in of_site.items()]
         return Poses(
             geom_xpos=_stack(geom_xpos).reshape(-1, 3),
             geom_xmat=_stack(geom_xmat).reshape(-1, 3, 3),

@@ -76,11 +76,15 @@ class Collision:
       clearances: `(poses) -> [P] float32`, distance of each pair, negative where it overlaps, m.
         Exact for planes. Between other shapes up to 2.2 mm too large at each corner of a box, and
         no less than minus the sum of the radii that `_core` gives.
+      geoms: `[G] int`, the geoms that occur in the pairs, by rising id.
+      clearances_of_geoms: the same function of poses of those geoms alone, which cost less.
     """
 
     pairs: np.ndarray
     margin: float
     clearances: Callable[[Poses], jax.Array]
+    geoms: np.ndarray
+    clearances_of_geoms: Callable[[Poses], jax.Array]
 
     def is_free(self, poses: Poses) -> jax.Array:
         """Whether all pairs are at least `margin` apart: `[] bool`."""
@@ -94,9 +98,10 @@ class Collision:
 
         Args:
           now: poses at the present state.
-          commanded: poses with the arm's joints where the command would have them.
+          commanded: poses of `geoms` alone, with the arm's joints where the command would have
+            them.
         """
-        before, after = self.clearances(now), self.clearances(commanded)
+        before, after = self.clearances(now), self.clearances_of_geoms(commanded)
         return jnp.any((after < np.float32(self.margin)) & (after < before - np.float32(_SAME)))
 
 
@@ -147,18 +152,23 @@ def make_self_collision(
     ids = np.asarray(pairs, int).reshape(-1, 2)
     planes = int((mj_model.geom_type[ids[:, 0]] == _PLANE).sum())
     sizes = np.asarray(cores, np.float32).reshape(-1, 2, 5)
-    return Collision(ids, margin, _make_clearances(ids, sizes, planes))
+    used = np.unique(ids)
+    of_all, of_used = (_make_clearances(ids, sizes, planes, take) for take in (used, None))
+    return Collision(ids, margin, of_all, used, of_used)
 
 
 def _make_clearances(
-    pairs: np.ndarray, cores: np.ndarray, planes: int
+    pairs: np.ndarray, cores: np.ndarray, planes: int, take: np.ndarray | None
 ) -> Callable[[Poses], jax.Array]:
     """`(poses) -> [P] float32` for pairs `[P, 2]` with cores `[P, 2, 5]`, the planes' first.
+
+    The poses are of all geoms, of which those in `take` count, or of the geoms of the pairs alone.
 
     Batches are the last axis inside, where vmap would make them the first: on CPU the pairs'
     constants are then scalars to a vector of environments, which is 8 times as fast.
     """
-    used, rows = np.unique(pairs, return_inverse=True)
+    rows = np.unique(pairs, return_inverse=True)[1]
+    used = slice(None) if take is None else take
     first, second = rows.reshape(-1, 2).T
 
     @jax.custom_batching.custom_vmap

@@ -20,7 +20,7 @@ from mjx_arm.envs.starts import StartSampler
 from mjx_arm.envs.state import EnvState, Observation, Placement, Snapshot, Transition
 from mjx_arm.envs.tasks import find_task
 from mjx_arm.envs.tasks.base import Reward, Task
-from mjx_arm.kinematics import Poses, make_camera_pose, make_kinematics
+from mjx_arm.kinematics import Kinematics, Poses, make_camera_pose, make_kinematics
 from mjx_arm.options import check_name
 from mjx_arm.physics import Physics, make_physics
 from mjx_arm.references import is_reference, load_reference, reference_to
@@ -45,7 +45,7 @@ class Env:
       physics: the backend's functions.
       starts: samples the starts of episodes.
       collision: whether the arm is free of itself, its base and the ground.
-      kinematics: poses of a `qpos` and params.
+      link_kinematics: poses of the geoms of `collision` alone, at a `qpos` and params.
       varies: which rows of the model's fields vary by episode.
       cameras: renders the image of each camera.
     """
@@ -58,7 +58,7 @@ class Env:
     physics: Physics
     starts: StartSampler
     collision: Collision
-    kinematics: Callable[..., Poses]
+    link_kinematics: Kinematics
     varies: Varies
     cameras: tuple[Camera, ...]
 
@@ -221,7 +221,8 @@ class Env:
 
     def _is_blocked(self, state: EnvState, ctrl: jax.Array) -> jax.Array:
         """Whether a command would take the arm into itself, its base or the ground: `[] bool`."""
-        commanded = self.kinematics(self.arm.commanded(state.physics.qpos, ctrl), state.params)
+        qpos = self.arm.commanded(state.physics.qpos, ctrl)
+        commanded = self.link_kinematics(qpos, state.params)
         return self.collision.is_blocked(state.physics.poses, commanded)
 
     def _check_action(self, action: jax.Array | int) -> None:
@@ -270,6 +271,7 @@ def make_env(config: EnvConfig, *, reward: Reward | None = None) -> Env:
     model, varies = scene.mj_model, task.varies
     check_varies(model, varies)
     kinematics = make_kinematics(model, varies)
+    collision = make_self_collision(model, home=arm.home_qpos)
     around = make_self_collision(model, obstacles=task.obstacles, home=arm.home_qpos)
     return Env(
         config=config,
@@ -285,8 +287,8 @@ def make_env(config: EnvConfig, *, reward: Reward | None = None) -> Env:
             varies=varies,
         ),
         starts=StartSampler(arm, task, around, kinematics, config),
-        collision=make_self_collision(model, home=arm.home_qpos),
-        kinematics=kinematics,
+        collision=collision,
+        link_kinematics=make_kinematics(model, varies, collision.geoms.tolist()),
         varies=varies,
         cameras=tuple(_make_camera(scene, name, config, varies) for name in config.cameras),
     )

@@ -120,12 +120,18 @@ def test_a_command_out_of_the_table_is_never_blocked():
         qpos[model.jnt_qposadr[lowest]] += np.deg2rad(degrees)
         return kinematics(jnp.asarray(qpos))
 
+    def links(degrees):
+        of_all = poses(degrees)
+        return of_all.replace(
+            geom_xpos=of_all.geom_xpos[collision.geoms], geom_xmat=of_all.geom_xmat[collision.geoms]
+        )
+
     assert collision.is_free(poses(0))
     assert not collision.is_free(poses(40))
-    assert collision.is_blocked(poses(39), poses(40))
-    assert not collision.is_blocked(poses(40), poses(39))
-    assert not collision.is_blocked(poses(40), poses(40))
-    assert not collision.is_blocked(poses(0), poses(1))
+    assert collision.is_blocked(poses(39), links(40))
+    assert not collision.is_blocked(poses(40), links(39))
+    assert not collision.is_blocked(poses(40), links(40))
+    assert not collision.is_blocked(poses(0), links(1))
 
 
 def test_an_obstacle_is_a_sphere_at_its_geom():
