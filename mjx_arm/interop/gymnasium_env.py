@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import os
 from collections.abc import Callable
 from typing import Any
 
@@ -20,6 +21,8 @@ from mjx_arm.physics import compiler_options
 # Edge of the pictures of `render`, pixels, and of how many a second.
 _PICTURE = 256
 _FPS = 30
+# The process that imported jax; a fork of it has none of the threads that jax waits for.
+_PROCESS = os.getpid()
 _MODES = {"next_step": AutoresetMode.NEXT_STEP, "same_step": AutoresetMode.SAME_STEP}
 
 
@@ -71,6 +74,7 @@ class ArmCubeEnv(gymnasium.Env[Any, np.int64]):
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": _FPS}  # noqa: RUF012
 
     def __init__(self, name: str = "A", render_mode: str | None = None, **options: Any):
+        _check_process()
         _check_render_mode(render_mode)
         self.render_mode = render_mode
         self.env = make(name, **options)
@@ -152,6 +156,7 @@ class ArmCubeVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
     ):
         if num_envs < 1:
             raise ValueError(f"num_envs must be at least 1, got {num_envs}")
+        _check_process()
         _check_render_mode(render_mode)
         self.render_mode = render_mode
         self.num_envs = num_envs
@@ -269,6 +274,14 @@ def _where_first(mask: np.ndarray, new: Any, old: Any) -> Any:
 
 def _draw_key(generator: np.random.Generator) -> jax.Array:
     return jax.random.key(generator.integers(2**32, dtype=np.uint32))
+
+
+def _check_process() -> None:
+    if os.getpid() != _PROCESS:
+        raise ValueError(
+            "this process was forked from one that runs jax, in which jax hangs: give "
+            "AsyncVectorEnv context='spawn', or use ArmCubeVectorEnv, which steps all at once"
+        )
 
 
 def _check_render_mode(mode: str | None) -> None:
