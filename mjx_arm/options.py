@@ -16,6 +16,7 @@ from collections.abc import Iterable, Mapping
 from typing import Annotated, Any, Literal, TypeVar, dataclass_transform
 
 import annotated_types
+import numpy as np
 import pydantic
 import pydantic.dataclasses
 from pydantic import Field
@@ -70,6 +71,25 @@ def options(cls: C) -> C:
 def _sentence(cls: type, values: Mapping[str, Any], error: pydantic.ValidationError) -> str:
     name = str(error.errors()[0]["loc"][0])
     return invalid(name, _annotations(cls)[name], values.get(name))
+
+
+def check_value(name: str, annotation: Any, value: Any) -> None:
+    """Refuses an argument that its annotation does not allow, as for an option.
+
+    Raises:
+      ValueError: says what is allowed and what was given.
+    """
+    plain = value.item() if isinstance(value, np.generic) else value
+    try:
+        _adapter(annotation).validate_python(plain)
+    except pydantic.ValidationError:
+        raise ValueError(invalid(name, annotation, value)) from None
+
+
+@functools.cache
+def _adapter(annotation: Any) -> pydantic.TypeAdapter:
+    strict = pydantic.ConfigDict(strict=True, allow_inf_nan=False, arbitrary_types_allowed=True)
+    return pydantic.TypeAdapter(annotation, config=strict)
 
 
 def invalid(name: str, annotation: Any, value: Any) -> str:
