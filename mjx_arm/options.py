@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import functools
+import pathlib
 import types
 import typing
 from collections.abc import Iterable, Mapping
@@ -125,6 +126,7 @@ def describe(annotation: Any) -> str:
         float: "a finite number",
         bool: "true or false",
         str: "text",
+        pathlib.Path: "a path",
         type(None): "None",
     }
     if annotation in words:
@@ -198,6 +200,15 @@ def flat_names(config: Any) -> dict[str, tuple[str, ...]]:
         else:
             places[field.name] = (field.name,)
     return places
+
+
+def flat_annotations(config: Any) -> dict[str, Any]:
+    """The annotation of each option of nested options, by its name alone."""
+    found: dict[str, Any] = {}
+    for name, annotation in _fields_of(type(config)).items():
+        value = getattr(config, name)
+        found |= flat_annotations(value) if dataclasses.is_dataclass(value) else {name: annotation}
+    return found
 
 
 def get_option(config: Any, name: str) -> Any:

@@ -23,12 +23,14 @@ from rich.console import Console
 
 from mjx_arm.algos.collect import Counts
 from mjx_arm.config import TrainConfig, set_train_options
+from mjx_arm.devices import check_device
 from mjx_arm.envs.env import make_env
 from mjx_arm.options import Count, Discount, check_value
 from mjx_arm.report.figures import plot_curves
 from mjx_arm.report.metrics import MetricsWriter, keep_metrics, last_env_steps, last_wall_s
 from mjx_arm.report.progress import (
     describe,
+    make_console,
     make_progress,
     say_device,
     say_memory,
@@ -149,7 +151,7 @@ def train(
       RunInterruptedError: Ctrl-C, SIGTERM, SIGHUP or SIGUSR1.
     """
     _check_options(eval_episodes, stop_at)
-    console = Console(highlight=False) if console is None else console
+    console = make_console() if console is None else console
     objects = Objects(env=env, network=network, reward=reward, algorithm=algorithm)
     trainer = _prepare(config, objects, console)
     recorded = record(config, objects)
@@ -206,7 +208,7 @@ def resume(
     """
     _check_options(eval_episodes, stop_at)
     folder = pathlib.Path(folder)
-    console = Console(highlight=False) if console is None else console
+    console = make_console() if console is None else console
     _check_whole_run(folder)
     saved = load_run(folder)
     check_untouched(folder, saved)
@@ -315,6 +317,7 @@ def _has_saved(trainer: Trainer, folder: pathlib.Path) -> bool:
 def _prepare(
     config: TrainConfig, objects: Objects, console: Console, scene: Scene | None = None
 ) -> Trainer:
+    check_device()
     say_device(console)
     parts = objects.given()
     if scene is not None and objects.env is None:
