@@ -324,7 +324,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     arguments = sys.argv[1:] if arguments is None else arguments
     try:
         command, given = _parse(arguments)
-        command.run(given)
+        # Whatever JAX_NUMPY_RANK_PROMOTION says: it is meant for the user's own programs.
+        with jax.numpy_rank_promotion("allow"):
+            command.run(given)
     except ValueError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
