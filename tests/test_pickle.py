@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import pickle
 
-import jax
 import jax.numpy as jnp
 import pytest
 
@@ -17,14 +16,12 @@ def own_reward(before, after, action):
 
 @pytest.mark.parametrize("reward", ["", own_reward])
 def test_an_environment_can_be_pickled(reward):
-    env = mjx_arm.make("B", reward=reward, observation="state", physics="native")
+    env = mjx_arm.make("A", reward=reward, size=(16, 16), physics="native")
     back = pickle.loads(pickle.dumps(env))
     assert back.config == env.config
     assert back.scene.source == env.scene.source
     assert (back.reward is own_reward) == (reward is own_reward)
-    # Abstract: compiling the two would take most of the tests' time.
-    shapes = [jax.eval_shape(x.reset, jax.random.key(0)) for x in (env, back)]
-    assert shapes[0] == shapes[1]
+    assert (back.num_actions, back.feature_scales) == (env.num_actions, env.feature_scales)
 
 
 def test_a_reward_that_no_process_could_import_is_named():
