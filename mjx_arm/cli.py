@@ -6,12 +6,12 @@ import argparse
 import contextlib
 import dataclasses
 import io
-import itertools
 import json
 import os
 import pathlib
 import signal
 import sys
+import typing
 from collections.abc import Sequence
 from types import FrameType
 from typing import Annotated, Any, NoReturn
@@ -20,16 +20,20 @@ import jax
 import tyro
 from rich.console import Console
 
+from mjx_arm.algos.exploration import check_epsilon
+from mjx_arm.arguments import read_arguments
 from mjx_arm.config import TrainConfig, set_train_options
-from mjx_arm.options import check_name, flat_names, get_option
+from mjx_arm.devices import check_device
+from mjx_arm.options import check_name, flat_annotations, flat_names, get_option
 from mjx_arm.presets import PRESETS
 from mjx_arm.report.figures import plot_curves
+from mjx_arm.report.progress import make_console
 from mjx_arm.report.video import check_video_path, draw_episode, record_episode, write_video
 from mjx_arm.training.agent import Agent, differences, load_agent
 from mjx_arm.training.evaluate import evaluate
 from mjx_arm.training.loop import EVALUATION, role_key
 from mjx_arm.training.run_folder import load_config, parse_run, read_text, seed_folders
-from mjx_arm.training.runner import RunInterruptedError, resume, train
+from mjx_arm.training.runner import RunInterruptedError, resume, stop_signals, train
 
 # Options that may change when a run is resumed.
 _CHANGEABLE = frozenset({"resume", "total_steps", "eval_episodes", "stop_at"})
@@ -68,7 +72,7 @@ class Train:
 
     def run(self, given: frozenset[str]) -> None:
         """Runs the command; `given` are the names of the options on the command line."""
-        console = Console(highlight=False)
+        console = make_console()
         if self.resume is not None:
             self._resume(self.resume, given, console)
             return
@@ -113,6 +117,8 @@ class _Try:
       epsilon: share of random actions.
       seed: of starts and random actions.
       max_steps: iterations until an episode is truncated.
+      scene: name or path of a scene to try it in, or `stored` for the one in the agent's file; by
+        default the one that it was trained in, as long as that has not changed.
     """
 
     agent: tyro.conf.Positional[pathlib.Path]
@@ -121,13 +127,16 @@ class _Try:
     epsilon: float = 0.1
     seed: int = 7
     max_steps: int = 1_000
+    scene: str | None = None
 
     def load(self) -> Agent:
+        check_device()
+        check_epsilon(self.epsilon)
         if not 0 <= self.seed < 2**31:
             raise ValueError(f"seed must be from 0 to {2**31 - 1}, got {self.seed}")
         options = {"env": self.env, "physics": self.physics}
         given = {name: value for name, value in options.items() if value is not None}
-        return load_agent(self.agent, max_steps=self.max_steps, **given)
+        return load_agent(self.agent, max_steps=self.max_steps, scene=self.scene, **given)
 
     def key(self) -> jax.Array:
         return role_key(self.seed, EVALUATION)
@@ -207,8 +216,19 @@ class Figures:
             print(path)
 
 
+Command = Train | Eval | Play | Figures
+_COMMANDS: dict[str, type[Command]] = {
+    "train": Train,
+    "eval": Eval,
+    "play": Play,
+    "figures": Figures,
+}
+_SUBJECTS = {"agent": "an agent's file or a run folder", "folder": "a run folder"}
+
+
 def default_preset() -> str:
     """`gpu` on an accelerator, `fast` on a CPU."""
+    check_device()
     return "fast" if jax.default_backend() == "cpu" else "gpu"
 
 
@@ -230,40 +250,68 @@ def _start(arguments: Sequence[str]) -> Train:
     return Train(options=set_train_options(options, chosen), preset=preset)
 
 
-def _parse(arguments: Sequence[str]) -> Train | Eval | Play | Figures:
-    """The command of a command line.
+def _parse(arguments: Sequence[str]) -> tuple[Command, frozenset[str]]:
+    """The command of a command line, and the names of the options on it.
 
     Raises:
-      ValueError: it does not fit.
+      ValueError: it is invalid.
     """
-    # The default makes `--help` show the values of the preset, and the options of the task.
+    if not arguments:
+        raise ValueError(f"give a command: one of {', '.join(_COMMANDS)}; see --help")
+    if not {"-h", "--help"}.isdisjoint(arguments):
+        _help(arguments)
+    check_name("command", arguments[0], _COMMANDS)
+    kind = _COMMANDS[arguments[0]]
+    if kind is Train:
+        return _parse_train(arguments[1:])
+    known = _annotations(kind)
+    subject = next(iter(known))
+    values, others = read_arguments(arguments[1:], known | {subject: pathlib.Path})
+    if not others:
+        raise ValueError(f"{arguments[0]} needs {subject.upper()}, {_SUBJECTS[subject]}")
+    _check_none(others[1:])
+    return kind(**{**values, subject: pathlib.Path(others[0])}), frozenset(values)
+
+
+def _parse_train(arguments: Sequence[str]) -> tuple[Train, frozenset[str]]:
+    start = _start(arguments)
+    own = {name: x for name, x in _annotations(Train).items() if name != "options"}
+    values, others = read_arguments(arguments, own | flat_annotations(start.options))
+    _check_none(others)
+    options = {name: value for name, value in values.items() if name not in own}
+    rest = {name: value for name, value in values.items() if name in own}
+    start = dataclasses.replace(start, **rest)
+    return (
+        dataclasses.replace(start, options=set_train_options(start.options, options)),
+        frozenset(values),
+    )
+
+
+def _annotations(kind: type) -> dict[str, Any]:
+    return typing.get_type_hints(kind, include_extras=True)
+
+
+def _check_none(others: Sequence[str]) -> None:
+    if others:
+        raise ValueError(f"unexpected argument {others[0]!r}: options start with --")
+
+
+def _help(arguments: Sequence[str]) -> NoReturn:
+    """Prints the help, which shows the values of the preset, and the options of the task."""
     with_preset = Annotated[Train, tyro.conf.subcommand("train", default=_start(arguments))]
     commands: Any = with_preset | Eval | Play | Figures
-    said = io.StringIO()
-    try:
-        with contextlib.redirect_stderr(said):
-            command: Train | Eval | Play | Figures = tyro.cli(
-                commands,
-                args=arguments,
-                prog="mjx-arm",
-                config=(
-                    tyro.conf.OmitArgPrefixes,
-                    tyro.conf.OmitSubcommandPrefixes,
-                    tyro.conf.AvoidSubcommands,
-                ),
-            )
-    except SystemExit as stop:
-        if stop.code == 2:
-            raise ValueError(_one_sentence(said.getvalue())) from None
-        raise
-    return command
-
-
-def _one_sentence(box: str) -> str:
-    """What tyro says in a box with advice below the first line across."""
-    rows = [line.strip("│ ") for line in box.splitlines()]
-    message = itertools.takewhile(lambda row: not row.startswith("─"), rows[1:])
-    return f"{' '.join(message).rstrip('.')}; see --help".replace("Unrecognized", "unknown")
+    first = [name for name in arguments[:1] if name in _COMMANDS]
+    tyro.cli(
+        commands,
+        args=[*first, "--help"],
+        prog="mjx-arm",
+        config=(
+            tyro.conf.OmitArgPrefixes,
+            tyro.conf.OmitSubcommandPrefixes,
+            tyro.conf.AvoidSubcommands,
+        ),
+    )
+    raise AssertionError("tyro ends the process")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -274,16 +322,23 @@ def main(arguments: Sequence[str] | None = None) -> int:
       that was interrupted.
     """
     arguments = sys.argv[1:] if arguments is None else arguments
-    names = (x[2:].split("=")[0] for x in arguments if x.startswith("--"))
-    given = frozenset(name.removeprefix("no-").replace("-", "_") for name in names)
     try:
-        _parse(arguments).run(given)
+        command, given = _parse(arguments)
+        # Whatever JAX_NUMPY_RANK_PROMOTION says: it is meant for the user's own programs.
+        with jax.numpy_rank_promotion("allow"):
+            command.run(given)
     except ValueError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
     except OSError as error:
         where = f"{error.filename}: " if error.filename else ""
-        print(f"error: {where}{error.strerror or error}", file=sys.stderr)
+        print(f"error: {where}{' '.join(str(error.strerror or error).split())}", file=sys.stderr)
+        return 2
+    except jax.errors.JaxRuntimeError as error:
+        if "RESOURCE_EXHAUSTED" not in str(error):
+            raise
+        advice = "give a smaller --replay-size, --num-envs or batch size"
+        print(f"error: the device has run out of memory: {advice}", file=sys.stderr)
         return 2
     except RunInterruptedError as stop:
         print(stop, file=sys.stderr)
@@ -294,9 +349,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def run(arguments: Sequence[str] | None = None) -> NoReturn:
     """Runs the command line as a process of its own, and ends it.
 
-    Ctrl-C ends it at once, which damages no file; while a run trains, it saves first.
+    Ctrl-C and what schedulers send end it at once, which damages no file; while a run trains, it
+    saves first.
     """
-    signal.signal(signal.SIGINT, _stop)
+    for number in stop_signals():
+        signal.signal(number, _stop)
+    for stream in (sys.stdout, sys.stderr):
+        # A terminal or a log that cannot show a character does not end a run.
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")
     sys.exit(main(arguments))
 
 
@@ -309,5 +370,6 @@ def _stop(number: int, frame: FrameType | None) -> NoReturn:
     # Not by print, which the signal may have interrupted.
     if os.isatty(1):
         os.write(1, b"\x1b[?25h")  # the cursor, which a progress bar hides
-    os.write(2, b"stopped; a run that has started continues with --resume and its folder\n")
-    os._exit(130)
+    with contextlib.suppress(OSError):  # the terminal may be gone
+        os.write(2, b"stopped; a run that has started continues with --resume and its folder\n")
+    os._exit(128 + number)

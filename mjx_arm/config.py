@@ -49,9 +49,10 @@ class NetworkConfig:
       kernels: edges of their kernels, pixels.
       strides: their strides, pixels.
       pool: edge of the max-pooling between them, pixels; 1 for none.
-      hidden: units of the first dense layer.
+      hidden: units of each hidden dense layer.
+      dense_layers: number of hidden dense layers.
       dueling: value and advantage streams (Wang et al. 2016).
-      layer_norm: LayerNorm after the first dense layer.
+      layer_norm: LayerNorm after each hidden dense layer.
       convolution: `patches` or `nn.Conv`; `auto` takes patches on a CPU, `nn.Conv` elsewhere.
     """
 
@@ -61,6 +62,7 @@ class NetworkConfig:
     strides: Widths = (2, 1, 1)
     pool: Count = 2
     hidden: Count = 256
+    dense_layers: Count = 1
     dueling: bool = True
     layer_norm: bool = False
     convolution: Literal["auto", "patches", "nn.Conv"] = "auto"

@@ -10,12 +10,14 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import functools
+import pathlib
 import types
 import typing
 from collections.abc import Iterable, Mapping
 from typing import Annotated, Any, Literal, TypeVar, dataclass_transform
 
 import annotated_types
+import numpy as np
 import pydantic
 import pydantic.dataclasses
 from pydantic import Field
@@ -72,6 +74,25 @@ def _sentence(cls: type, values: Mapping[str, Any], error: pydantic.ValidationEr
     return invalid(name, _annotations(cls)[name], values.get(name))
 
 
+def check_value(name: str, annotation: Any, value: Any) -> None:
+    """Refuses an argument that its annotation does not allow, as for an option.
+
+    Raises:
+      ValueError: says what is allowed and what was given.
+    """
+    plain = value.item() if isinstance(value, np.generic) else value
+    try:
+        _adapter(annotation).validate_python(plain)
+    except pydantic.ValidationError:
+        raise ValueError(invalid(name, annotation, value)) from None
+
+
+@functools.cache
+def _adapter(annotation: Any) -> pydantic.TypeAdapter:
+    strict = pydantic.ConfigDict(strict=True, allow_inf_nan=False, arbitrary_types_allowed=True)
+    return pydantic.TypeAdapter(annotation, config=strict)
+
+
 def invalid(name: str, annotation: Any, value: Any) -> str:
     """The sentence about a value that an option does not take."""
     too_large = type(value) is int and value > MOST
@@ -105,6 +126,7 @@ def describe(annotation: Any) -> str:
         float: "a finite number",
         bool: "true or false",
         str: "text",
+        pathlib.Path: "a path",
         type(None): "None",
     }
     if annotation in words:
@@ -178,6 +200,15 @@ def flat_names(config: Any) -> dict[str, tuple[str, ...]]:
         else:
             places[field.name] = (field.name,)
     return places
+
+
+def flat_annotations(config: Any) -> dict[str, Any]:
+    """The annotation of each option of nested options, by its name alone."""
+    found: dict[str, Any] = {}
+    for name, annotation in _fields_of(type(config)).items():
+        value = getattr(config, name)
+        found |= flat_annotations(value) if dataclasses.is_dataclass(value) else {name: annotation}
+    return found
 
 
 def get_option(config: Any, name: str) -> Any:

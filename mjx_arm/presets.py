@@ -35,6 +35,8 @@ PRESETS: dict[str, TrainConfig] = {
     "fast": train_config(
         algorithm="distill",
         max_steps=500,
+        layer_norm=True,
+        dense_layers=2,
         replay_size=1_000_000,
         total_steps=2_500_000,
         select_every=131_072,
@@ -71,6 +73,8 @@ PRESETS: dict[str, TrainConfig] = {
     "gpu": train_config(
         algorithm="distill",
         num_envs=4_096,
+        layer_norm=True,
+        dense_layers=2,
         max_steps=500,
         replay_size=4_194_304,
         chunk_steps=262_144,

@@ -8,6 +8,7 @@ import numpy as np
 import optax
 
 from mjx_arm.config import ExplorationConfig
+from mjx_arm.options import Share, check_value
 
 
 def epsilon_at(config: ExplorationConfig, env_steps: jax.Array) -> jax.Array:
@@ -34,8 +35,7 @@ def check_epsilon(epsilon: float) -> None:
     Raises:
       ValueError: it is not from 0 to 1.
     """
-    if not 0.0 <= epsilon <= 1.0:
-        raise ValueError(f"epsilon must be from 0 to 1, got {epsilon}")
+    check_value("epsilon", Share, epsilon)
 
 
 def epsilon_greedy(key: jax.Array, q: jax.Array, epsilon: jax.Array) -> jax.Array:

@@ -25,7 +25,7 @@ from mjx_arm.options import check_name
 from mjx_arm.physics import Physics, make_physics
 from mjx_arm.references import is_reference, load_reference, reference_to
 from mjx_arm.render import make_renderer, rgb, segmentation
-from mjx_arm.scene import Scene, load_scene
+from mjx_arm.scene import Scene, SceneSource, compile_scene, load_scene
 from mjx_arm.varies import Params, Varies, check_varies
 
 # `(qpos, poses, params)` -> packed pixels, and with depth the z-depth.
@@ -61,6 +61,11 @@ class Env:
     link_kinematics: Kinematics
     varies: Varies
     cameras: tuple[Camera, ...]
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickles how to make the environment: compiled functions have no other form."""
+        reward = self.reward if is_reference(self.config.reward) else None
+        return _remake, (self.config, reward, self.scene.name, self.scene.source)
 
     @property
     def num_actions(self) -> int:
@@ -258,14 +263,15 @@ def make(env: str = "A", *, reward: str | Reward = "", **options: Any) -> Env:
     return make_env(env_config(env, reward=reward, **options))
 
 
-def make_env(config: EnvConfig, *, reward: Reward | None = None) -> Env:
+def make_env(config: EnvConfig, *, reward: Reward | None = None, scene: Scene | None = None) -> Env:
     """Makes the environment of a configuration; see `make`.
 
     Args:
       config: the options.
       reward: the function that `config.reward` names; by default it is imported.
+      scene: the scene that `config.scene` names; by default it is read from its files.
     """
-    scene = load_scene(config.scene_name)
+    scene = load_scene(config.scene_name) if scene is None else scene
     arm = resolve_arm(scene)
     task = find_task(config.task).make(config.task_options, scene, arm)
     model, varies = scene.mj_model, task.varies
@@ -292,6 +298,11 @@ def make_env(config: EnvConfig, *, reward: Reward | None = None) -> Env:
         varies=varies,
         cameras=tuple(_make_camera(scene, name, config, varies) for name in config.cameras),
     )
+
+
+def _remake(config: EnvConfig, reward: Reward | None, name: str, source: SceneSource) -> Env:
+    """An environment that was pickled."""
+    return make_env(config, reward=reward, scene=compile_scene(name, source))
 
 
 def _find_reward(config: EnvConfig, task: Task) -> Reward:

@@ -54,18 +54,20 @@ class PatchConv(nn.Module):
 
 
 class Head(nn.Module):
-    """The dense layers: one hidden, one output; with `dueling` a value and an advantage stream."""
+    """The dense layers: hidden ones and an output; with `dueling` a value and an advantage stream."""
 
     hidden: int
     num_actions: int
     dueling: bool
     layer_norm: bool = False
+    layers: int = 1
 
     @nn.compact
     def __call__(self, x: jax.Array) -> jax.Array:
         """Q-values of features `[B, F] float32`: `[B, num_actions] float32`."""
-        x = nn.Dense(self.hidden, kernel_init=nn.initializers.he_normal())(x)
-        x = nn.relu(nn.LayerNorm()(x) if self.layer_norm else x)
+        for _ in range(self.layers):
+            x = nn.Dense(self.hidden, kernel_init=nn.initializers.he_normal())(x)
+            x = nn.relu(nn.LayerNorm()(x) if self.layer_norm else x)
         advantage = nn.Dense(self.num_actions)(x)
         if not self.dueling:
             return advantage
@@ -84,7 +86,8 @@ class PixelQNetwork(nn.Module):
       pool: edge of the max-pooling between them, 1 for none.
       hidden: units of the first dense layer.
       dueling: split the last layer into value and advantage (Wang et al. 2016).
-      layer_norm: LayerNorm after the first dense layer.
+      layer_norm: LayerNorm after each hidden dense layer.
+      layers: number of hidden dense layers.
       patches: how to convolve; see `PatchConv`.
     """
 
@@ -96,6 +99,7 @@ class PixelQNetwork(nn.Module):
     hidden: int
     dueling: bool
     layer_norm: bool = False
+    layers: int = 1
     patches: bool = True
 
     @nn.compact
@@ -114,7 +118,9 @@ class PixelQNetwork(nn.Module):
             pool = self.pool if layer < len(self.widths) - 1 else 1
             x = nn.relu(PatchConv(width, kernel, stride, pool, self.patches)(x))
         x = x.reshape(x.shape[0], -1)
-        return Head(self.hidden, self.num_actions, self.dueling, self.layer_norm)(x)
+        head = Head(self.hidden, self.num_actions, self.dueling, self.layer_norm, self.layers)
+        q: jax.Array = head(x)
+        return q
 
 
 class FeatureQNetwork(nn.Module):
@@ -184,5 +190,6 @@ def make_network(
         hidden=config.hidden,
         dueling=config.dueling,
         layer_norm=config.layer_norm,
+        layers=config.dense_layers,
         patches=patches,
     )

@@ -52,13 +52,17 @@ class MetricsWriter:
 
 
 def keep_metrics(folder: pathlib.Path, env_steps: int) -> None:
-    """Drops the lines of `metrics.jsonl` after so many environment steps, which come again."""
+    """Drops the lines of `metrics.jsonl` after so many environment steps, which come again.
+
+    Raises:
+      ValueError: a line is damaged.
+    """
     path = folder / "metrics.jsonl"
-    lines = path.read_text().splitlines(keepends=True) if path.is_file() else []
-    whole = [line for line in lines if line.endswith("\n")]
-    kept = [line for line in whole if json.loads(line)["env_steps"] <= env_steps]
+    lines = _whole_lines(path) if path.is_file() else []
+    rows = _read_rows(path) if path.is_file() else []
+    kept = [line for line, row in zip(lines, rows, strict=True) if row["env_steps"] <= env_steps]
     shorter = path.with_suffix(".part")
-    shorter.write_text("".join(kept))
+    shorter.write_bytes(b"".join(kept))
     shorter.replace(path)
 
 
@@ -94,7 +98,20 @@ def read_metrics(folder: pathlib.Path) -> list[dict[str, float]]:
 
 
 def _read_rows(path: pathlib.Path) -> list[dict[str, float]]:
+    return [_parse_row(path, i + 1, line) for i, line in enumerate(_whole_lines(path))]
+
+
+def _whole_lines(path: pathlib.Path) -> list[bytes]:
     # A process that was killed may have left half a line.
-    lines = [x for x in path.read_text().splitlines(keepends=True) if x.endswith("\n")]
-    rows = [json.loads(line) for line in lines]
-    return [{k: float("nan") if v is None else v for k, v in row.items()} for row in rows]
+    return [line for line in path.read_bytes().splitlines(keepends=True) if line.endswith(b"\n")]
+
+
+def _parse_row(path: pathlib.Path, number: int, line: bytes) -> dict[str, float]:
+    try:
+        row = json.loads(line)
+        known = isinstance(row, dict) and all(name in row for name in ("env_steps", "wall_s"))
+        if known and all(x is None or type(x) in (int, float) for x in row.values()):
+            return {name: math.nan if x is None else x for name, x in row.items()}
+    except (ValueError, RecursionError):
+        pass
+    raise ValueError(f"{path}, line {number} is damaged: restore it, or remove the line")

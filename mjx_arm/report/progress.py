@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import codecs
 import math
 import pathlib
 import shutil
+import sys
 import time
 from types import TracebackType
-from typing import Self
+from typing import Any, Self
 
 import jax
 from rich.console import Console
@@ -16,6 +18,30 @@ from rich.progress import BarColumn, Progress, TextColumn
 _SECONDS_BETWEEN_LINES = 30.0
 # Episodes that the shown success rate averages over.
 _SMOOTHING = 200.0
+
+
+class _Lossy:
+    """A text file that writes `?` for what its encoding has no character for."""
+
+    def __init__(self, file: Any):
+        self._file = file
+
+    def write(self, text: str) -> int:
+        encoding = self._file.encoding
+        written: int = self._file.write(text.encode(encoding, "replace").decode(encoding))
+        return written
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._file, name)
+
+
+def make_console() -> Console:
+    """A console on the standard output, which no character that it lacks can end."""
+    encoding = getattr(sys.stdout, "encoding", None) or "utf-8"
+    if codecs.lookup(encoding).name == "utf-8":
+        return Console(highlight=False)
+    file: Any = _Lossy(sys.stdout)
+    return Console(file=file, highlight=False)
 
 
 def say_device(console: Console) -> None:

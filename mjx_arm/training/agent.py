@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import os
 import pathlib
 from collections.abc import Mapping
 from typing import Any
@@ -17,17 +18,20 @@ import safetensors
 import safetensors.numpy
 
 from mjx_arm.algos.base import Algorithm
-from mjx_arm.algos.exploration import epsilon_greedy
+from mjx_arm.algos.exploration import check_epsilon, epsilon_greedy
 from mjx_arm.config import TrainConfig, dump_config, parse_config, set_train_options
 from mjx_arm.envs.config import EnvConfig
 from mjx_arm.envs.env import Env, make_env
-from mjx_arm.options import flat_names, get_option, set_options
+from mjx_arm.options import flat_names, get_option, invalid, set_options
+from mjx_arm.scene import Scene, SceneSource, compile_scene, load_scene, read_source, scene_exists
 from mjx_arm.training.algorithm import make_algorithm
 from mjx_arm.training.objects import Objects, Record, check_record
 
 _FORMAT = "mjx_arm agent 2"
 LAST, BEST = "last.safetensors", "best.safetensors"
 # What an agent sees; all other options of the environment are fixed by its name.
+# Means the scene in an agent's file where a scene's name is asked for.
+STORED = "stored"
 _SIGHT = ("scene", "task", "observation", "size", "camera", "shadows")
 
 
@@ -43,6 +47,8 @@ class Agent:
       params: of the network.
       env_steps: environment steps that it was trained for.
       selection_rate: share of successes in the evaluation that selected it, or None.
+      evaluation: result of the evaluation at the end of its run, or None.
+      card: text about the agent.
     """
 
     config: TrainConfig
@@ -52,6 +58,8 @@ class Agent:
     params: Any
     env_steps: int
     selection_rate: float | None
+    evaluation: dict[str, Any] | None = None
+    card: str = ""
 
     def apply(self, params: Any, obs: jax.Array) -> jax.Array:
         """Q-values of observations `[N, ...]`, `[N, A] float32`."""
@@ -71,7 +79,12 @@ class Agent:
 
         Returns:
           `[] int32`.
+
+        Raises:
+          ValueError: `epsilon` is not from 0 to 1.
         """
+        if not isinstance(epsilon, jax.Array):
+            check_epsilon(epsilon)
         return epsilon_greedy(key, self.q_values(obs)[None], jnp.float32(epsilon))[0]
 
 
@@ -80,10 +93,12 @@ def save_agent(
     config: TrainConfig,
     params: Any,
     *,
-    scene: str,
+    scene: SceneSource,
     objects: Record,
     env_steps: int,
     selection_rate: float | None = None,
+    evaluation: Mapping[str, Any] | None = None,
+    card: str = "",
 ) -> None:
     """Writes an agent to one file: whole, or not at all.
 
@@ -93,10 +108,12 @@ def save_agent(
       path: of the file, which ends in `.safetensors`.
       config: of the run.
       params: of the network.
-      scene: text of the scene.
+      scene: the files of the scene.
       objects: record of the user's own objects.
       env_steps: environment steps of the training.
       selection_rate: share of successes in the evaluation that selected it.
+      evaluation: result of an evaluation, as a JSON object.
+      card: text about the agent.
 
     Raises:
       ValueError: the disk is full, or the folder cannot be written.
@@ -106,19 +123,37 @@ def save_agent(
     metadata = {
         "format": _FORMAT,
         "config": json.dumps(dump_config(config)),
-        "scene": scene,
+        "scene": json.dumps(scene.to_json()),
         "objects": json.dumps(objects),
         "env_steps": json.dumps(env_steps),
         "selection_rate": json.dumps(selection_rate),
+        "evaluation": json.dumps(evaluation),
+        "card": card,
     }
-    metadata["sha256"] = _digest(metadata, tensors)
+    _write(path, metadata, tensors)
+
+
+def add_evaluation(path: pathlib.Path, evaluation: Mapping[str, Any]) -> None:
+    """Writes the result of an evaluation into an agent's file.
+
+    Raises:
+      ValueError: the file is damaged, or cannot be written.
+    """
+    metadata, tensors = read_agent(path)
+    _write(path, metadata | {"evaluation": json.dumps(evaluation)}, tensors)
+
+
+def _write(
+    path: pathlib.Path, metadata: Mapping[str, str], tensors: Mapping[str, np.ndarray]
+) -> None:
+    sealed = {**metadata, "sha256": _digest(metadata, tensors)}
     part = path.with_name(f"{path.name}.part")
     try:
-        part.write_bytes(safetensors.numpy.save(tensors, metadata))
+        part.write_bytes(safetensors.numpy.save(dict(tensors), sealed))
         part.replace(path)
     except OSError as error:
         part.unlink(missing_ok=True)
-        raise ValueError(f"{path} could not be written: {error.strerror}") from error
+        raise ValueError(f"{path} could not be written: {error.strerror or error}") from error
 
 
 def flatten_params(params: Any) -> dict[str, Any]:
@@ -164,6 +199,7 @@ def load_agent(
     network: Any = None,
     reward: Any = None,
     env: str | None = None,
+    scene: str | pathlib.Path | None = None,
     **options: Any,
 ) -> Agent:
     """Reads a trained agent, with the environment to try it in.
@@ -178,11 +214,16 @@ def load_agent(
       network: the Flax module, if the agent was trained with one that was passed as an object.
       reward: the same for a reward.
       env: `"A"` or `"B"`; by default the one that it was trained in.
+      scene: name or path of a scene, or `"stored"` for the one in the agent's file; by default the
+        one that it was trained in, as long as that has not changed.
       **options: other options to change, such as `physics`.
 
     Raises:
-      ValueError: there is no agent, or it is damaged, or an option does not fit.
+      ValueError: there is no agent, or it is damaged, or an option does not fit, or the scene is
+        not the one in the agent's file any more.
     """
+    if not isinstance(path, str | os.PathLike):
+        raise ValueError(invalid("path", str, path))
     path = find_agent(pathlib.Path(path))
     metadata, tensors = read_agent(path)
     trained = parse_config(metadata["config"], str(path))
@@ -191,7 +232,12 @@ def load_agent(
     judged = evaluation_config(trained.env, env=env, max_steps=max_steps)
     config = dataclasses.replace(trained, env=judged)
     config = set_train_options(config, options)
-    made = make_env(config.env, reward=reward)
+    if scene is not None and str(scene) != STORED:
+        config = set_train_options(config, {"scene": str(scene)})
+    stored = SceneSource.from_json(json.loads(metadata["scene"]), str(path))
+    made = make_env(
+        config.env, reward=reward, scene=_find_scene(path, trained, config, stored, scene)
+    )
     algorithm = make_algorithm(config, made, network)
     params = _restore(path, algorithm, made, tensors)
     return Agent(
@@ -202,7 +248,30 @@ def load_agent(
         params,
         json.loads(metadata["env_steps"]),
         json.loads(metadata["selection_rate"]),
+        json.loads(metadata["evaluation"]),
+        metadata["card"],
     )
+
+
+def _find_scene(
+    path: pathlib.Path,
+    trained: TrainConfig,
+    config: TrainConfig,
+    stored: SceneSource,
+    wanted: str | pathlib.Path | None,
+) -> Scene:
+    """The scene that an agent is tried in; see `load_agent`."""
+    name = config.env.scene_name
+    if wanted is not None and str(wanted) == STORED:
+        return compile_scene(trained.env.scene_name, stored)
+    if wanted is not None or name != trained.env.scene_name:
+        return load_scene(name)
+    if scene_exists(name) and read_source(name).digest != stored.digest:
+        raise ValueError(
+            f"the scene {name!r} is not the one that {path} was trained in: give --scene {STORED} "
+            f"for the one in the file, or --scene {name} for the one here"
+        )
+    return compile_scene(name, stored)
 
 
 def _restore(
@@ -213,14 +282,28 @@ def _restore(
         return algorithm.init_policy(jax.random.key(0), jax.tree.map(lambda x: x[None], obs))
 
     expected = flatten_params(jax.eval_shape(init))
-    shapes = {name: (x.shape, x.dtype) for name, x in expected.items()}
-    if {name: (x.shape, x.dtype) for name, x in tensors.items()} != shapes:
+    shapes = {name: x.shape for name, x in expected.items()}
+    if {name: x.shape for name, x in tensors.items()} != shapes:
         raise ValueError(f"{path} holds the parameters of another network")
-    for name, x in tensors.items():
-        if not np.isfinite(x).all():
-            raise ValueError(f"{path} holds numbers in {name!r} that are not finite")
+    check_tensors(path, tensors, {name: x.dtype for name, x in expected.items()})
     arrays = {name: jnp.asarray(tensors[name]) for name in expected}
     return flax.traverse_util.unflatten_dict(arrays, sep="/")
+
+
+def check_tensors(
+    path: pathlib.Path, tensors: Mapping[str, np.ndarray], dtypes: Mapping[str, Any]
+) -> None:
+    """Refuses the tensors of an agent that have another dtype or are not finite, by name.
+
+    Raises:
+      ValueError: one has, or is not.
+    """
+    for name, dtype in dtypes.items():
+        x = tensors[name]
+        if x.dtype != dtype:
+            raise ValueError(f"{path}: {name!r} must be of type {dtype}, got {x.dtype}")
+        if not np.isfinite(x).all():
+            raise ValueError(f"{path}: {name!r} must hold finite numbers, got inf or nan")
 
 
 def evaluation_config(

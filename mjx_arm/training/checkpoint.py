@@ -1,8 +1,14 @@
-"""Checkpoints on disk, by orbax: whole or not there at all, and the last two of a run kept."""
+"""Checkpoints on disk, by orbax: whole or not there at all, and the last two of a run kept.
+
+A checkpoint is a folder with the arrays, `state`, and `manifest.json`, which says whose they are
+and has a digest of each file.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import dataclasses
+import hashlib
 import json
 import logging
 import os
@@ -10,40 +16,65 @@ import pathlib
 import shutil
 import tempfile
 import threading
-import zlib
 from collections.abc import Iterator
 from typing import Any
 
 import jax
 
 from mjx_arm.training.memory import tree_size
+from mjx_arm.training.seal import is_sealed, seal
 
 _KEPT = 2
 _DIGITS = 12
 _MANIFEST = "manifest.json"
+_STATE = "state"
+# What orbax writes beside the arrays, bytes.
+_OVERHEAD = 4_000_000
+# Options that may change while a run goes on.
+_FREE = ("total_steps",)
 
 
-def save_tree(path: pathlib.Path, tree: Any) -> None:
-    """Writes a pytree of arrays to a folder, and last a manifest without which it does not count.
+@dataclasses.dataclass(frozen=True)
+class Origin:
+    """What a checkpoint belongs to.
+
+    Attributes:
+      run_id: of the run.
+      config: the run's options as a JSON object.
+      scene: digest of the run's scene.
+    """
+
+    run_id: str
+    config: dict[str, Any]
+    scene: str
+
+
+def save_tree(
+    path: pathlib.Path, tree: Any, *, origin: Origin | None = None, step: int | None = None
+) -> None:
+    """Writes a pytree of arrays to a folder: whole, or not at all.
+
+    Args:
+      path: of the folder; what is there is replaced.
+      tree: the arrays.
+      origin: what the manifest says that they belong to.
+      step: the vector step after which they were taken.
 
     Raises:
       ValueError: the disk is full, or the folder cannot be written.
     """
-    # orbax and tensorstore are the heaviest part of the install: only who saves loads them.
-    import orbax.checkpoint as ocp
-
+    part = path.with_name(f"{path.name}.part")
     try:
-        _check_room(path.parent, tree_size(tree))
-        with _without_tracebacks(), ocp.StandardCheckpointer() as checkpointer:
-            checkpointer.save(path.absolute(), _to_data(tree), force=True)
-        manifest = {"files": _checksums(path), "arrays": _describe(tree)}
-        part = path / f"{_MANIFEST}.part"
-        part.write_text(json.dumps(manifest))
-        part.replace(path / _MANIFEST)
+        shutil.rmtree(part, ignore_errors=True)
+        part.mkdir(parents=True)
+        _check_room(part, tree_size(tree) + _OVERHEAD)
+        _write_arrays(part / _STATE, tree)
+        write_manifest(part, tree, origin=origin, step=step)
+        shutil.rmtree(path, ignore_errors=True)
+        part.replace(path)
     except (OSError, ValueError) as error:
-        for left in path.parent.glob(f"{path.name}.orbax-checkpoint-tmp*"):
-            shutil.rmtree(left, ignore_errors=True)
-        reason = " ".join(str(error).split())[:200]
+        shutil.rmtree(part, ignore_errors=True)
+        reason = getattr(error, "strerror", None) or " ".join(str(error).split())[:200]
         raise ValueError(f"the checkpoint {path} could not be written: {reason}") from error
 
 
@@ -54,14 +85,21 @@ def _check_room(folder: pathlib.Path, size: int) -> None:
     """
     if not hasattr(os, "posix_fallocate"):
         return
-    folder.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryFile(dir=folder) as file:
         os.posix_fallocate(file.fileno(), 0, size)
 
 
+def _write_arrays(path: pathlib.Path, tree: Any) -> None:
+    # orbax is the heaviest part of the install: only a save or a resume loads it.
+    import orbax.checkpoint as ocp
+
+    with _without_tracebacks(), ocp.StandardCheckpointer() as checkpointer:
+        checkpointer.save(path.absolute(), _to_data(tree), force=True)
+
+
 @contextlib.contextmanager
 def _without_tracebacks() -> Iterator[None]:
-    """Keeps orbax from telling of a failure thread by thread: it raises it as well."""
+    """Keeps orbax from reporting a failure from each thread: it raises the failure as well."""
     hook = threading.excepthook
     loggers = [logging.getLogger(name) for name in ("absl", "asyncio")]
     before = [logger.disabled for logger in loggers]
@@ -76,6 +114,19 @@ def _without_tracebacks() -> Iterator[None]:
             logger.disabled = disabled
 
 
+def write_manifest(
+    path: pathlib.Path, tree: Any, *, origin: Origin | None = None, step: int | None = None
+) -> None:
+    """Writes the manifest of a folder that holds the arrays of a tree; see `save_tree`."""
+    manifest = {
+        "step": step,
+        "origin": None if origin is None else dataclasses.asdict(origin),
+        "arrays": _describe(tree),
+        "files": _digests(path),
+    }
+    (path / _MANIFEST).write_text(seal(manifest))
+
+
 def load_tree(path: pathlib.Path, like: Any) -> Any:
     """Reads a pytree with the structure, shapes and dtypes of `like`.
 
@@ -87,43 +138,93 @@ def load_tree(path: pathlib.Path, like: Any) -> Any:
     # A read that fails half-way leaves orbax with coroutines to complain of.
     check_tree(path, like)
     with ocp.StandardCheckpointer() as checkpointer:
-        return _from_data(checkpointer.restore(path.absolute(), _here(_to_data(like))), like)
+        data = checkpointer.restore((path / _STATE).absolute(), _here(_to_data(like)))
+    return _from_data(data, like)
 
 
-def check_tree(path: pathlib.Path, like: Any) -> None:
-    """Refuses what `load_tree` could not read.
+def check_tree(
+    path: pathlib.Path, like: Any, *, origin: Origin | None = None, step: int | None = None
+) -> None:
+    """Refuses what `load_tree` could not read, and what belongs to something else.
+
+    Args:
+      path: of the checkpoint.
+      like: a tree of the same structure, shapes and dtypes.
+      origin: what the checkpoint must belong to; None for anything.
+      step: the vector step that it must be of; None for any.
 
     Raises:
       ValueError: there is no checkpoint, or it is damaged, or of something else.
     """
     if not (path / _MANIFEST).is_file():
         raise ValueError(f"{path} is not a checkpoint, or not a whole one")
-    files, arrays = _read_manifest(path)
-    if files != _checksums(path):
+    manifest = read_manifest(path)
+    if manifest is None or manifest["files"] != _digests(path):
         raise ValueError(f"{path} is damaged: its files are not those that were written")
-    if arrays != _describe(like):
+    if step is not None and manifest["step"] != step:
+        raise ValueError(f"{path} must be the checkpoint of step {step}, got {manifest['step']}")
+    if origin is not None:
+        _check_origin(path, manifest["origin"], origin)
+    if manifest["arrays"] != _describe(like):
         raise ValueError(f"{path} is not a checkpoint of such a run")
 
 
-def _read_manifest(path: pathlib.Path) -> tuple[Any, Any]:
-    """The checksums of a checkpoint's files and its arrays, None where the manifest has none."""
+def _check_origin(path: pathlib.Path, made: dict[str, Any] | None, wanted: Origin) -> None:
+    found = None if made is None else Origin(**made)
+    if found is None or found.run_id != wanted.run_id:
+        raise ValueError(f"{path} is a checkpoint of another run: restore the run's own")
+    if found.scene != wanted.scene:
+        raise ValueError(f"{path} was made in another scene than this run has")
+    changed = config_differences(found.config, wanted.config)
+    if changed:
+        raise ValueError(f"{path} was made with other options: {changed}")
+
+
+def config_differences(trained: dict[str, Any], given: dict[str, Any]) -> str:
+    """In words, the options in which a configuration differs from a run's; empty if in none.
+
+    Args:
+      trained: what the run was trained with, as a JSON object.
+      given: what the configuration says now.
+    """
+    before, now = (_flat(json.loads(json.dumps(config))) for config in (trained, given))
+    names = [name for name in before | now if name not in _FREE]
+    return ", ".join(
+        f"{name} was {before.get(name)} and is now {now.get(name)}"
+        for name in names
+        if before.get(name) != now.get(name)
+    )
+
+
+def _flat(config: dict[str, Any]) -> dict[str, Any]:
+    """Options by their names alone, which are unique across the groups."""
+    flat: dict[str, Any] = {}
+    for name, value in config.items():
+        flat |= _flat(value) if isinstance(value, dict) else {name: value}
+    return flat
+
+
+def read_manifest(path: pathlib.Path) -> dict[str, Any] | None:
+    """What the manifest of a checkpoint says, or None where it is damaged."""
     try:
-        manifest = json.loads((path / _MANIFEST).read_text())
-    except (json.JSONDecodeError, UnicodeDecodeError):
-        manifest = None
-    if not isinstance(manifest, dict):
-        return None, None
-    return manifest.get("files"), manifest.get("arrays")
+        text = (path / _MANIFEST).read_text()
+    except UnicodeDecodeError:
+        return None
+    if not is_sealed(text):
+        return None
+    manifest: dict[str, Any] = json.loads(text)
+    return manifest
 
 
-def _checksums(path: pathlib.Path) -> dict[str, int]:
-    """CRC-32 of each file of a checkpoint, but for the manifest."""
-    files = (file for file in path.rglob("*") if file.is_file())
-    return {
-        str(file.relative_to(path)): zlib.crc32(file.read_bytes())
-        for file in files
-        if not file.name.startswith(_MANIFEST)
-    }
+def _digests(path: pathlib.Path) -> dict[str, str]:
+    """SHA-256 of each file of a checkpoint, but for the manifest."""
+    digests = {}
+    for file in sorted(path.rglob("*")):
+        if file.is_file() and file.name != _MANIFEST:
+            with file.open("rb") as opened:
+                digest = hashlib.file_digest(opened, "sha256").hexdigest()
+            digests[str(file.relative_to(path))] = digest
+    return digests
 
 
 def _describe(tree: Any) -> list[str]:
@@ -133,10 +234,14 @@ def _describe(tree: Any) -> list[str]:
 
 
 class RunCheckpoints:
-    """The checkpoints of a run folder, by the number of vector steps that they were taken after."""
+    """The checkpoints of a run folder, by the number of vector steps that they were taken after.
 
-    def __init__(self, folder: pathlib.Path):
+    With an `origin` those that belong to something else are refused.
+    """
+
+    def __init__(self, folder: pathlib.Path, origin: Origin | None = None):
         self.folder = folder / "checkpoints"
+        self._origin = origin
 
     def save(self, vector_step: int, state: Any) -> None:
         """Writes a checkpoint, then removes all but the last two.
@@ -144,12 +249,7 @@ class RunCheckpoints:
         Raises:
           ValueError: it could not be written.
         """
-        path = self._path(vector_step)
-        try:
-            save_tree(path, state)
-        except ValueError:
-            shutil.rmtree(path, ignore_errors=True)
-            raise
+        save_tree(self._path(vector_step), state, origin=self._origin, step=vector_step)
         for step in self.steps()[:-_KEPT]:
             shutil.rmtree(self._path(step))
 
@@ -166,22 +266,32 @@ class RunCheckpoints:
         steps = self.steps()
         return f"{steps[-1]:0{_DIGITS}d}" if steps else None
 
+    def newest_config(self) -> dict[str, Any] | None:
+        """The options that the newest checkpoint was made with, if one says."""
+        for step in reversed(self.steps()):
+            manifest = read_manifest(self._path(step))
+            if manifest is not None and manifest["origin"] is not None:
+                config: dict[str, Any] = manifest["origin"]["config"]
+                return config
+        return None
+
     def find_newest(self, like: Any) -> int:
         """The vector step of the newest checkpoint, which `load` can read.
 
         Raises:
-          ValueError: there is none, or it is damaged; names the newest whole one, if there is one.
+          ValueError: there is none, or it is damaged, or of another run, step or configuration;
+            names the newest whole one, if there is one.
         """
         steps = self.steps()
         if not steps:
             raise ValueError(f"{self.folder} holds no checkpoint to continue from")
         try:
-            check_tree(self._path(steps[-1]), like)
+            self._check(steps[-1], like)
             return steps[-1]
         except ValueError as error:
             for step in reversed(steps[:-1]):
                 try:
-                    check_tree(self._path(step), like)
+                    self._check(step, like)
                 except ValueError:
                     continue
                 raise ValueError(
@@ -196,6 +306,9 @@ class RunCheckpoints:
           ValueError: it is damaged, or of another run.
         """
         return load_tree(self._path(step), like)
+
+    def _check(self, step: int, like: Any) -> None:
+        check_tree(self._path(step), like, origin=self._origin, step=step)
 
     def _path(self, step: int) -> pathlib.Path:
         return self.folder / f"{step:0{_DIGITS}d}"

@@ -18,6 +18,7 @@ from mjx_arm.algos.collect import Counts, Episodes, act, count_episodes, init_ep
 from mjx_arm.algos.exploration import check_epsilon
 from mjx_arm.envs.auto_reset import AutoReset, AutoResetState
 from mjx_arm.envs.env import Env
+from mjx_arm.options import Count, check_value
 from mjx_arm.physics import compiler_options
 
 # Environments side by side, and iterations in one compiled call.
@@ -80,8 +81,7 @@ def make_evaluator(
     Raises:
       ValueError: `episodes` below 1, or `epsilon` outside 0 to 1.
     """
-    if episodes < 1:
-        raise ValueError(f"episodes must be at least 1, got {episodes}")
+    check_value("episodes", Count, episodes)
     check_epsilon(epsilon)
     auto = AutoReset(env)
 

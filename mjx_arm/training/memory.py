@@ -11,12 +11,22 @@ import numpy as np
 
 from mjx_arm.physics import Physics
 
-_FIELDS = ("learner", "envs", "obs", "replay")
+# The parts of a run, and the options that make them smaller.
+_SETTINGS = {
+    "learner": "network, by --hidden or --widths",
+    "envs": "--num-envs",
+    "obs": "--num-envs or --size",
+    "replay": "--replay-size",
+    "working": "--num-envs, or batch size",
+}
+_PARTS = ("learner", "envs", "obs", "replay")
+# Control groups say "no limit" by a number close to 2**63.
+_NO_LIMIT = 2**60
 
 
 def memory_plan(state: Any) -> dict[str, int]:
     """Bytes of each part of a `LoopState`, or of its shapes from `jax.eval_shape`."""
-    return {name: tree_size(getattr(state, name)) for name in _FIELDS}
+    return {name: tree_size(getattr(state, name)) for name in _PARTS}
 
 
 def working_memory(compiled: jax.stages.Compiled, physics: Physics, simulations: int) -> int:
@@ -33,23 +43,26 @@ def check_memory(plan: dict[str, int]) -> None:
     """Refuses a plan that cannot fit.
 
     Raises:
-      ValueError: it needs more than the device, or on CPU the machine, has free.
+      ValueError: it needs more than the device, or on CPU the machine or its container, has free;
+        names the setting that takes the most.
     """
     needed, free = sum(plan.values()), free_memory()
     if free is not None and needed > free:
+        part = max(plan, key=lambda name: plan[name])
         raise ValueError(
-            f"the run needs {needed / 1e9:.2f} GB, of which the replay {plan['replay'] / 1e9:.2f} "
-            f"GB, and {free / 1e9:.2f} GB are free: give a smaller --replay-size or --num-envs"
+            f"the run needs {needed / 1e9:.2f} GB, of which {part} {plan[part] / 1e9:.2f} GB, and "
+            f"{free / 1e9:.2f} GB are free: give a smaller {_SETTINGS[part]}"
         )
 
 
 def free_memory() -> int | None:
     """Bytes free on the default device, or on CPU in the machine; None where nobody says."""
     device = jax.devices()[0]
-    if device.platform == "cpu":
-        return _free_of_machine()
-    stats = device.memory_stats()
-    return stats["bytes_limit"] - stats["bytes_in_use"] if stats else None
+    if device.platform != "cpu":
+        stats = device.memory_stats()
+        return stats["bytes_limit"] - stats["bytes_in_use"] if stats else None
+    known = [x for x in (_free_of_machine(), free_of_container()) if x is not None]
+    return min(known, default=None)
 
 
 def _free_of_machine() -> int | None:
@@ -62,6 +75,47 @@ def _free_of_machine() -> int | None:
         return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     except (ValueError, OSError):
         return None
+
+
+def free_of_container(root: pathlib.Path = pathlib.Path("/")) -> int | None:
+    """Bytes that the control groups of this process leave it, None without a limit.
+
+    Both versions of control groups are read, each group with all that it is in.
+
+    Args:
+      root: of the file system.
+    """
+    try:
+        lines = (root / "proc/self/cgroup").read_text().splitlines()
+    except OSError:
+        return None
+    top, free = root / "sys/fs/cgroup", []
+    for line in lines:
+        number, controllers, path = line.split(":", 2)
+        if number == "0":
+            names = ("memory.max", "memory.current", "inactive_file")
+            free += [_free_of_group(group, *names) for group in _groups(top, path)]
+        elif "memory" in controllers.split(","):
+            names = ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file")
+            free += [_free_of_group(group, *names) for group in _groups(top / "memory", path)]
+    return min((x for x in free if x is not None), default=None)
+
+
+def _groups(top: pathlib.Path, path: str) -> list[pathlib.Path]:
+    """A control group and those that it is in. Of its path a container may see only the top."""
+    parts = [part for part in path.split("/") if part not in ("", "..")]
+    return [top.joinpath(*parts[:count]) for count in range(len(parts) + 1)]
+
+
+def _free_of_group(group: pathlib.Path, limit: str, used: str, cache: str) -> int | None:
+    """Bytes below the limit of one control group; what only caches files counts as free."""
+    try:
+        most = int((group / limit).read_text())
+        taken = int((group / used).read_text())
+        stat = dict(line.split() for line in (group / "memory.stat").read_text().splitlines())
+    except (OSError, ValueError):  # no such file, or "max"
+        return None
+    return None if most >= _NO_LIMIT else max(0, most - taken + int(stat.get(cache, 0)))
 
 
 def tree_size(tree: Any) -> int:

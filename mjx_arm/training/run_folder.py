@@ -8,6 +8,7 @@ import datetime
 import json
 import os
 import pathlib
+import uuid
 from collections.abc import Iterator
 from typing import Any
 
@@ -15,7 +16,10 @@ import filelock
 import jax
 
 from mjx_arm.config import TrainConfig, dump_config, parse_config
+from mjx_arm.scene import SceneSource
+from mjx_arm.training.checkpoint import Origin, RunCheckpoints, config_differences
 from mjx_arm.training.objects import Record
+from mjx_arm.training.seal import is_sealed, seal
 
 CONFIG = "config.json"
 EVALUATION = "evaluation.json"
@@ -29,12 +33,21 @@ class SavedRun:
     Attributes:
       config: the options.
       objects: record of the user's own objects.
-      scene: text of the scene.
+      scene: the files of the scene.
+      run_id: of the run, which no other has.
+      intact: the file is as the run wrote it.
     """
 
     config: TrainConfig
     objects: Record
-    scene: str
+    scene: SceneSource
+    run_id: str = dataclasses.field(default_factory=lambda: uuid.uuid4().hex)
+    intact: bool = True
+
+    @property
+    def origin(self) -> Origin:
+        """What the run's checkpoints belong to."""
+        return Origin(self.run_id, dump_config(self.config), self.scene.digest)
 
 
 def save_run(folder: pathlib.Path, run: SavedRun) -> None:
@@ -49,9 +62,13 @@ def save_run(folder: pathlib.Path, run: SavedRun) -> None:
 
 
 def _write(folder: pathlib.Path, run: SavedRun) -> None:
-    content = dump_config(run.config) | {"objects": run.objects, "scene_text": run.scene}
+    content = dump_config(run.config) | {
+        "run_id": run.run_id,
+        "objects": run.objects,
+        "scene_source": run.scene.to_json(),
+    }
     part = folder / f"{CONFIG}.part"
-    part.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+    part.write_text(seal(content), encoding="utf-8")
     part.replace(folder / CONFIG)
 
 
@@ -78,15 +95,31 @@ def parse_run(text: str, where: str) -> SavedRun:
     Raises:
       ValueError: it is not the configuration of a run of this version.
     """
-    objects: Record = {}
-    scene = ""
-    with contextlib.suppress(json.JSONDecodeError):
+    intact = is_sealed(text)
+    objects, run_id, scene = {}, "", SceneSource("")
+    with contextlib.suppress(json.JSONDecodeError, RecursionError):
         values = json.loads(text)
         if isinstance(values, dict):
-            objects = values.pop("objects", {})
-            scene = values.pop("scene_text", "")
+            values.pop("sha256", None)
+            objects, run_id = values.pop("objects", {}), values.pop("run_id", "")
+            source = values.pop("scene_source", None)
+            scene = SceneSource.from_json(source, where) if intact else scene
             text = json.dumps(values)
-    return SavedRun(parse_config(text, where), objects, scene)
+    return SavedRun(parse_config(text, where), objects, scene, run_id, intact)
+
+
+def check_untouched(folder: pathlib.Path, run: SavedRun) -> None:
+    """Refuses to continue a run whose `config.json` was edited.
+
+    Raises:
+      ValueError: it was; names the options that differ from those of the newest checkpoint.
+    """
+    if run.intact:
+        return
+    trained = RunCheckpoints(folder).newest_config()
+    changed = config_differences(trained, dump_config(run.config)) if trained else ""
+    what = f": {changed}" if changed else ""
+    raise ValueError(f"{folder / CONFIG} has changed since the run wrote it{what}; restore it")
 
 
 def read_text(path: pathlib.Path) -> str:

@@ -23,14 +23,26 @@ from rich.console import Console
 
 from mjx_arm.algos.collect import Counts
 from mjx_arm.config import TrainConfig, advice, set_train_options
+from mjx_arm.devices import check_device
 from mjx_arm.envs.env import make_env
+from mjx_arm.options import Count, Discount, check_value
 from mjx_arm.report.figures import plot_curves
 from mjx_arm.report.metrics import MetricsWriter, keep_metrics, last_env_steps, last_wall_s
-from mjx_arm.report.progress import RunProgress, say_device, say_memory, say_working_memory
+from mjx_arm.report.progress import (
+    RunProgress,
+    make_console,
+    say_device,
+    say_memory,
+    say_working_memory,
+)
 from mjx_arm.report.video import draw_episode, record_episode, write_video
+from mjx_arm.scene import Scene, compile_scene, read_source, scene_exists
 from mjx_arm.training.agent import (
     BEST,
     LAST,
+    STORED,
+    add_evaluation,
+    check_tensors,
     evaluation_config,
     find_agent,
     flatten_params,
@@ -58,6 +70,7 @@ from mjx_arm.training.objects import Objects, check_record, record
 from mjx_arm.training.run_folder import (
     EVALUATION,
     SavedRun,
+    check_untouched,
     load_run,
     locked,
     new_run_folder,
@@ -79,6 +92,17 @@ OnChunk = Callable[[list[dict[str, float]], LoopState], None]
 # Chunks between two checkpoints.
 _SAVE_EVERY = 10
 _SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP", "SIGUSR1")
+
+
+def stop_signals() -> list[int]:
+    """The signals that ask a run to stop, without a hangup that `nohup` lets it ignore."""
+    numbers = [getattr(signal, name) for name in _SIGNALS if hasattr(signal, name)]
+    ignored = {
+        number
+        for number in numbers
+        if number != signal.SIGINT and signal.getsignal(number) == signal.SIG_IGN
+    }
+    return [number for number in numbers if number not in ignored]
 
 
 class RunInterruptedError(Exception):
@@ -126,7 +150,7 @@ def train(
       RunInterruptedError: Ctrl-C, SIGTERM, SIGHUP or SIGUSR1.
     """
     _check_options(eval_episodes, stop_at)
-    console = Console(highlight=False) if console is None else console
+    console = make_console() if console is None else console
     objects = Objects(env=env, network=network, reward=reward, algorithm=algorithm)
     trainer = _prepare(config, objects, console)
     recorded = record(config, objects)
@@ -139,7 +163,7 @@ def train(
         state = trainer.init(run_keys(config))
         if init_from is not None:
             state = _start_from(trainer, state, pathlib.Path(init_from))
-        run = SavedRun(_with_backend(config, trainer), recorded, trainer.env.scene.xml)
+        run = SavedRun(_with_backend(config, trainer), recorded, trainer.env.scene.source)
         save_run(folder, run)
         loop = _Loop(trainer, run, run_chunk, folder, console, stop_at, on_chunk)
         console.print(f"training: {config.total_steps:,} environment steps")
@@ -184,18 +208,20 @@ def resume(
     """
     _check_options(eval_episodes, stop_at)
     folder = pathlib.Path(folder)
-    console = Console(highlight=False) if console is None else console
+    console = make_console() if console is None else console
     _check_whole_run(folder)
     saved = load_run(folder)
+    check_untouched(folder, saved)
     objects = Objects(env=env, network=network, reward=reward, algorithm=algorithm)
     check_record(saved.objects, saved.config, objects, str(folder))
+    scene = _scene_of(folder, saved, objects)
     config = saved.config
     if total_steps is not None:
         config = dataclasses.replace(config, total_steps=total_steps)
     with locked(folder):
         console.print(f"run folder: {folder}", soft_wrap=True)
-        trainer = _prepare(config, objects, console)
-        checkpoints = RunCheckpoints(folder)
+        trainer = _prepare(config, objects, console, scene)
+        checkpoints = RunCheckpoints(folder, saved.origin)
         saved_any = _has_saved(trainer, folder)
         vector_step = checkpoints.find_newest(_shapes(trainer)) if saved_any else 0
         done = vector_step * config.num_envs
@@ -226,6 +252,25 @@ def _with_backend(config: TrainConfig, trainer: Trainer) -> TrainConfig:
     return set_train_options(config, {"physics": trainer.env.physics.backend})
 
 
+def _scene_of(folder: pathlib.Path, saved: SavedRun, objects: Objects) -> Scene:
+    """The scene of a run that is resumed.
+
+    Raises:
+      ValueError: it has changed since the run was started.
+    """
+    name = saved.config.env.scene_name
+    source = saved.scene
+    if objects.env is not None:
+        source = objects.env.scene.source
+    elif scene_exists(name):
+        source = read_source(name)
+    if source.digest != saved.scene.digest:
+        raise ValueError(
+            f"the scene {name!r} has changed since the run in {folder} was started: restore it"
+        )
+    return compile_scene(name, source)
+
+
 def _start_from(trainer: Trainer, state: LoopState, path: pathlib.Path) -> LoopState:
     """The state with the parameters of an agent."""
     path = find_agent(path)
@@ -238,6 +283,7 @@ def _start_from(trainer: Trainer, state: LoopState, path: pathlib.Path) -> LoopS
         raise ValueError(
             f"--init-from {path} holds the parameters of another network than this run trains"
         )
+    check_tensors(path, tensors, {name: x.dtype for name, x in flat.items()})
     arrays = {name: jnp.broadcast_to(tensors[name], (*seeds, *shapes[name])) for name in flat}
     params = flax.traverse_util.unflatten_dict(arrays, sep="/")
     learner = trainer.algorithm.with_policy(state.learner, params)
@@ -245,10 +291,8 @@ def _start_from(trainer: Trainer, state: LoopState, path: pathlib.Path) -> LoopS
 
 
 def _check_options(eval_episodes: int, stop_at: float | None) -> None:
-    if eval_episodes < 1:
-        raise ValueError(f"eval_episodes must be at least 1, got {eval_episodes}")
-    if stop_at is not None and not 0.0 < stop_at <= 1.0:
-        raise ValueError(f"stop_at must be above 0 and at most 1, got {stop_at}")
+    check_value("eval_episodes", Count, eval_episodes)
+    check_value("stop_at", Discount | None, stop_at)
 
 
 def _check_whole_run(folder: pathlib.Path) -> None:
@@ -270,11 +314,17 @@ def _has_saved(trainer: Trainer, folder: pathlib.Path) -> bool:
     return ended or RunCheckpoints(folder).newest() is not None or last_env_steps(first) > unsaved
 
 
-def _prepare(config: TrainConfig, objects: Objects, console: Console) -> Trainer:
+def _prepare(
+    config: TrainConfig, objects: Objects, console: Console, scene: Scene | None = None
+) -> Trainer:
+    check_device()
     say_device(console)
     for sentence in advice(config):
         console.print(f"[yellow]warning: {sentence}[/yellow]", soft_wrap=True)
-    trainer = make_trainer(config, **objects.given())
+    parts = objects.given()
+    if scene is not None and objects.env is None:
+        parts["env"] = make_env(config.env, reward=objects.reward, scene=scene)
+    trainer = make_trainer(config, **parts)
     plan = memory_plan(_shapes(trainer))
     say_memory(console, plan)
     check_memory(plan)
@@ -369,7 +419,7 @@ class _Loop:
     def run(self, state: LoopState, done: int) -> None:
         """Runs all chunks after the first `done`."""
         config, started = self.trainer.config, time.perf_counter()
-        checkpoints = RunCheckpoints(self.folder)
+        checkpoints = RunCheckpoints(self.folder, self.saved.origin)
         per_chunk = config.chunk_length * config.num_envs
         with contextlib.ExitStack() as stack:
             stack.enter_context(_offering(checkpoints))
@@ -402,7 +452,8 @@ class _Loop:
 
     def _results(self, started: float) -> list[_Results]:
         config = self.trainer.config
-        judged = make_env(evaluation_config(config.env), reward=self.trainer.env.reward)
+        env = self.trainer.env
+        judged = make_env(evaluation_config(config.env), reward=env.reward, scene=env.scene)
         evaluator = make_evaluator(
             judged,
             self.trainer.algorithm.apply,
@@ -482,8 +533,9 @@ class _Interruption:
     def __enter__(self) -> Self:
         # Only the main thread may set handlers.
         if threading.current_thread() is threading.main_thread():
-            numbers = [getattr(signal, name) for name in _SIGNALS if hasattr(signal, name)]
-            self._before = {number: signal.signal(number, self._handle) for number in numbers}
+            self._before = {
+                number: signal.signal(number, self._handle) for number in stop_signals()
+            }
         return self
 
     def __exit__(
@@ -497,7 +549,8 @@ class _Interruption:
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
         before = self._before[number]
-        if self.asked and callable(before):
+        # Schedulers may send theirs more than once: only a second Ctrl-C means at once.
+        if self.asked and number == signal.SIGINT and callable(before):
             before(number, frame)
         self.asked = True
 
@@ -522,7 +575,7 @@ def _finish_seed(
     for path in plot_curves([folder], into=folder):
         console.print(f"curves: {path}", soft_wrap=True)
     console.print(f"evaluating: {eval_episodes} episodes")
-    agent = load_agent(folder, network=objects.network, reward=objects.reward)
+    agent = load_agent(folder, network=objects.network, reward=objects.reward, scene=STORED)
     console.print(f"agent: {find_agent(folder)}, after {agent.env_steps:,} steps", soft_wrap=True)
     key = role_key(_EVALUATION_SEED, EVALUATION_ROLE)
     result = evaluate(
@@ -534,6 +587,7 @@ def _finish_seed(
         key=key,
     )
     (folder / EVALUATION).write_text(json.dumps(dataclasses.asdict(result)) + "\n")
+    add_evaluation(find_agent(folder), dataclasses.asdict(result))
     low, high = result.ci95
     console.print(
         f"evaluation: {result.successes} of {result.episodes} episodes succeeded, "
