@@ -54,7 +54,7 @@ class PatchConv(nn.Module):
 
 
 class Head(nn.Module):
-    """The dense layers: hidden ones and an output; with `dueling` a value and an advantage stream."""
+    """Hidden dense layers and an output; with `dueling` a value and an advantage stream."""
 
     hidden: int
     num_actions: int
