@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import pathlib
+from collections.abc import Iterator
+from xml.etree import ElementTree
 
 import mujoco
 import numpy as np
@@ -22,7 +25,7 @@ class Scene:
     Attributes:
       name: the scene's name or path, as it was given.
       mj_model: the plain MuJoCo model. Treat it as read-only.
-      xml: text of the MJCF file.
+      xml: text of the MJCF file, followed by the texts of the files that it includes or attaches.
     """
 
     name: str
@@ -124,12 +127,37 @@ def load_scene(name_or_path: str | pathlib.Path) -> Scene:
     """
     path = _resolve(str(name_or_path))
     try:
-        mj_model = mujoco.MjModel.from_xml_path(str(path))
+        with _quiet():
+            mj_model = mujoco.MjModel.from_xml_path(str(path))
     except ValueError as error:
         reason = " ".join(str(error).split())
         raise ValueError(f"scene {str(name_or_path)!r} does not compile: {reason}") from error
     validate_geoms(mj_model)
-    return Scene(name=str(name_or_path), mj_model=mj_model, xml=path.read_text(encoding="utf-8"))
+    return Scene(name=str(name_or_path), mj_model=mj_model, xml=_read(path))
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """Keeps MuJoCo from printing warnings and from writing MUJOCO_LOG.TXT.
+
+    It warns of a body that is attached without a prefix, because such a model may not be saved
+    correctly. It is never saved here.
+    """
+    before, quiet = mujoco.MjLogConfig.get(), mujoco.MjLogConfig.get()
+    quiet.logto_console = quiet.logto_file = False
+    mujoco.MjLogConfig.set(quiet)
+    try:
+        yield
+    finally:
+        mujoco.MjLogConfig.set(before)
+
+
+def _read(path: pathlib.Path) -> str:
+    """Text of an MJCF file, followed by the texts of the files that it includes or attaches."""
+    text = path.read_text(encoding="utf-8")
+    elements = ElementTree.fromstring(text).iter()
+    names = [x.get("file") for x in elements if x.tag in ("include", "model")]
+    return "".join([text, *(_read(path.parent / name) for name in names if name)])
 
 
 def _resolve(name_or_path: str) -> pathlib.Path:
