@@ -6,9 +6,8 @@ from mjx_arm.config import TrainConfig, train_config
 
 # `fast` is the default on a CPU; `pixels` has no teacher that sees the simulator's state; the agent
 # of `state` sees the state itself and no image; `smoke` shows in minutes that everything works;
-# `paper` has every value that James & Johns 2016 state,
-# and where they state none (batch, target period, number of environments) ours; `gpu` is for
-# thousands of environments on an accelerator.
+# `paper` has every value that James & Johns 2016 state, and where they state none (batch, target
+# period, number of environments) ours; `gpu` is for thousands of environments on an accelerator.
 PRESETS: dict[str, TrainConfig] = {
     "fast": train_config(
         algorithm="distill",

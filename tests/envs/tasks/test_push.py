@@ -74,7 +74,8 @@ def test_environment_a_is_constant():
     env = mjx_arm.make("A", task="push", physics="native", observation="state")
     reset = jax.jit(env.reset)
     states = [reset(jax.random.key(seed))[1] for seed in (0, 1)]
-    np.testing.assert_array_equal(states[0].physics.qpos, env.scene.mj_model.key("home").qpos)
+    home = env.scene.mj_model.key("home").qpos.astype(np.float32)
+    np.testing.assert_array_equal(states[0].physics.qpos, home)
     np.testing.assert_array_equal(states[0].physics.qpos, states[1].physics.qpos)
     mark = env.scene.mj_model.geom("mark").pos
     np.testing.assert_array_equal(states[0].params["geom_pos"][0], mark.astype(np.float32))

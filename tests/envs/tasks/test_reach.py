@@ -206,7 +206,10 @@ BOX = '"0.35 0 0.2 0.1 0.2 0.15"'
     [
         ([('name="target"', 'name="goal"')], "no geom named 'target'"),
         ([('"sphere" size="0.02"', '"box" size="0.02 0.02 0.02"')], "'target' must be a sphere"),
-        ([(GEOM, 'mass="0" rgba="0 1 0 0"/>')], "'target' must have no contacts"),
+        (
+            [('contype="0" conaffinity="0" mass', 'contype="1" mass')],
+            "'target' must have no contacts",
+        ),
         ([(GEOM, GEOM.replace("/>", ' group="3"/>'))], "'target' must be visible"),
         (
             [('<geom name="target"', '<body><geom name="target"'), (GEOM, f"{GEOM}</body>")],
