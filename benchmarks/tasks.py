@@ -5,7 +5,9 @@ the selection found best is then judged in 1,000 episodes at epsilon 0.1, with s
 training nor selection has seen.
 
     python benchmarks/tasks.py --json benchmarks/results/tasks.json
-    python benchmarks/tasks.py --tasks reach --json benchmarks/results/tasks.json
+    python benchmarks/tasks.py --tasks reach --runs FOLDER --json benchmarks/results/tasks.json
+
+With `--runs`, a run that FOLDER holds already, such as `FOLDER/reach-0`, is judged as it is.
 
 Results of tasks that are not trained again stay in the file, each with the machine it is from.
 """
@@ -26,29 +28,41 @@ from machine import machine
 import mjx_arm
 from mjx_arm.config import dump_config, set_train_options
 from mjx_arm.report.metrics import read_metrics
+from mjx_arm.training.evaluate import evaluate
+from mjx_arm.training.loop import EVALUATION, role_key
+from mjx_arm.training.run_folder import load_config
 
 # Environment steps of training, and the success rate to reach.
 STEPS = {"reach": 500_000, "push": 2_500_000}
 GOALS = {"reach": 0.95, "push": 0.85}
 EPISODES = 1_000
+EPSILON = 0.1
+SEED = 7
 
 
 def measure(task: str, seed: int, folder: pathlib.Path) -> dict[str, Any]:
     """Trains on one task, judges the best agent, and returns the task's row."""
-    options = {"task": task, "env": "B", "total_steps": STEPS[task], "seed": seed}
-    config = set_train_options(mjx_arm.PRESETS["state"], options)
-    load = os.getloadavg()[0]
-    (evaluation,) = mjx_arm.train(config, folder, eval_episodes=EPISODES)
-    rows = read_metrics(folder)
+    if not (folder / "config.json").is_file():
+        options = {"task": task, "env": "B", "total_steps": STEPS[task], "seed": seed}
+        config = set_train_options(mjx_arm.PRESETS["state"], options)
+        mjx_arm.train(config, folder, eval_episodes=1)
+    agent, rows = mjx_arm.load_agent(folder), read_metrics(folder)
+    evaluation = evaluate(
+        agent.env,
+        agent.apply,
+        agent.params,
+        episodes=EPISODES,
+        epsilon=EPSILON,
+        key=role_key(SEED, EVALUATION),
+    )
     return {
         "task": task,
         "seed": seed,
         "goal": GOALS[task],
-        "command": f"train.py --preset state --task {task} --env B --seed {seed} "
-        f"--total-steps {STEPS[task]} --eval-episodes {EPISODES}",
+        "agent_env_steps": agent.env_steps,
         "env_steps": rows[-1]["env_steps"],
         "minutes": rows[-1]["wall_s"] / 60,
-        "load_average_at_start": load,
+        "epsilon": EPSILON,
         "evaluation": dataclasses.asdict(evaluation),
         "selections": [
             {
@@ -57,10 +71,11 @@ def measure(task: str, seed: int, folder: pathlib.Path) -> dict[str, Any]:
                 "rate": row["selection_rate"],
             }
             for row in rows
-            if row["selection_rate"] is not None and math.isfinite(row["selection_rate"])
+            if math.isfinite(row["selection_rate"])
         ],
+        "load_average": os.getloadavg()[0],
         "machine": machine(),
-        "config": dump_config(config),
+        "config": dump_config(load_config(folder)),
     }
 
 

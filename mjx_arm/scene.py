@@ -5,8 +5,8 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import pathlib
+import re
 from collections.abc import Iterator
-from xml.etree import ElementTree
 
 import mujoco
 import numpy as np
@@ -16,6 +16,8 @@ from mjx_arm.render.geoms import validate_geoms
 _PACKAGE = pathlib.Path(__file__).parent
 # An installed package carries its scenes; a checkout has them at the top level.
 _XML_DIRS = (_PACKAGE / "xml", _PACKAGE.parent / "xml")
+# By pattern: MuJoCo reads files that are not XML to the letter.
+_INCLUDED = re.compile(r"""<(?:include|model)\b[^>]*\bfile=["']([^"']+)["']""")
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -155,9 +157,8 @@ def _quiet() -> Iterator[None]:
 def _read(path: pathlib.Path) -> str:
     """Text of an MJCF file, followed by the texts of the files that it includes or attaches."""
     text = path.read_text(encoding="utf-8")
-    elements = ElementTree.fromstring(text).iter()
-    names = [x.get("file") for x in elements if x.tag in ("include", "model")]
-    return "".join([text, *(_read(path.parent / name) for name in names if name)])
+    files = [path.parent / name for name in _INCLUDED.findall(text)]
+    return "".join([text, *(_read(file) for file in files if file.is_file())])
 
 
 def _resolve(name_or_path: str) -> pathlib.Path:
