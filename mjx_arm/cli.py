@@ -46,9 +46,9 @@ class Train:
     Attributes:
       preset: starting point of all other options. `fast`: the default on a CPU; a teacher that
         sees the simulator's state learns, and an agent that sees pixels alone learns from it.
-        `pixels`: no network ever sees the state. `smoke`: everything once, within 3 minutes.
-        `paper`: the values of James & Johns 2016. `gpu`: the default on an accelerator, `fast` with
-        thousands of environments.
+        `pixels`: no network ever sees the state. `state`: the agent sees the state, no image.
+        `smoke`: everything once, within 3 minutes. `paper`: the values of James & Johns 2016.
+        `gpu`: the default on an accelerator, `fast` with thousands of environments.
       config: a JSON file with options to start from instead of a preset, such as the `config.json`
         of a run.
       options: options of the run.

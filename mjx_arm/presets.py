@@ -27,10 +27,10 @@ from __future__ import annotations
 
 from mjx_arm.config import TrainConfig, train_config
 
-# `fast` is the default on a CPU; `pixels` has no teacher that sees the simulator's state; `smoke`
-# shows in minutes that everything works; `paper` has every value that James & Johns 2016 state,
-# and where they state none (batch, target period, number of environments) ours; `gpu` is for
-# thousands of environments on an accelerator.
+# `fast` is the default on a CPU; `pixels` has no teacher that sees the simulator's state; the agent
+# of `state` sees the state itself and no image; `smoke` shows in minutes that everything works;
+# `paper` has every value that James & Johns 2016 state, and where they state none (batch, target
+# period, number of environments) ours; `gpu` is for thousands of environments on an accelerator.
 PRESETS: dict[str, TrainConfig] = {
     "fast": train_config(
         algorithm="distill",
@@ -43,6 +43,18 @@ PRESETS: dict[str, TrainConfig] = {
         select_episodes=200,
     ),
     "pixels": train_config(n_step=5),
+    "state": train_config(
+        observation="state",
+        hidden=512,
+        layer_norm=True,
+        batch_size=512,
+        n_step=5,
+        polyak=0.005,
+        replay_size=1_000_000,
+        total_steps=2_500_000,
+        select_every=131_072,
+        select_episodes=200,
+    ),
     "smoke": train_config(
         total_steps=32_768,
         replay_size=20_000,

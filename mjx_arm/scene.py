@@ -14,6 +14,7 @@ import mujoco
 import numpy as np
 
 from mjx_arm.render.geoms import validate_geoms
+from mjx_arm.silence import mujoco_silence
 
 _PACKAGE = pathlib.Path(__file__).parent
 # An installed package carries its scenes; a checkout has them at the top level.
@@ -190,7 +191,8 @@ def compile_scene(name: str, source: SceneSource) -> Scene:
       ValueError: MuJoCo cannot compile it, or a geom in it cannot be rendered.
     """
     try:
-        mj_model = mujoco.MjModel.from_xml_string(source.xml, source.files)
+        with mujoco_silence:
+            mj_model = mujoco.MjModel.from_xml_string(source.xml, source.files)
     except (ValueError, mujoco.FatalError) as error:
         raise _does_not_compile(name, error) from error
     validate_geoms(mj_model)

@@ -36,6 +36,7 @@ from mjx_arm.physics.base import (
     settled_activations,
 )
 from mjx_arm.physics.float_bits import float32_to_bits, float64_to_words
+from mjx_arm.silence import mujoco_silence
 from mjx_arm.varies import Params, Varies
 
 _STATE = mujoco.mjtState
@@ -116,34 +117,6 @@ class BatchPool:
         if DERIVING_FIELDS.intersection(self._varies):
             batch.set_const()
         return batch
-
-
-class _Silence:
-    """Keeps MuJoCo from printing warnings and writing MUJOCO_LOG.TXT; safe to nest and to share."""
-
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._depth = 0
-        self._saved: mujoco.MjLogConfig | None = None
-
-    def __enter__(self) -> None:
-        with self._lock:
-            if self._depth == 0:
-                self._saved = mujoco.MjLogConfig.get()
-                quiet = mujoco.MjLogConfig.get()
-                quiet.logto_file = False
-                quiet.logto_console = False
-                mujoco.MjLogConfig.set(quiet)
-            self._depth += 1
-
-    def __exit__(self, *exc_info: object) -> None:
-        with self._lock:
-            self._depth -= 1
-            if self._depth == 0:
-                mujoco.MjLogConfig.set(self._saved)
-
-
-_silence = _Silence()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -336,7 +309,7 @@ def _step_rows(
     """Advances `rows [..., 2 carried + nu + params]` by an iteration into `out [..., out_size]`."""
     rows, out = rows.reshape(-1, rows.shape[-1]), out.reshape(-1, layout.out_size)
     split = layout.carried_words
-    with pool.borrow(len(rows)) as batch, _silence:
+    with pool.borrow(len(rows)) as batch, mujoco_silence:
         carried = batch.state[:, : layout.carried]
         words = float64_to_words(carried)
         words[:] = rows[:, :split]

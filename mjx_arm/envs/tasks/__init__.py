@@ -8,6 +8,8 @@ from typing import Any
 
 from mjx_arm.envs.tasks.base import Task, TaskConfig
 from mjx_arm.envs.tasks.lift import Lift, LiftConfig
+from mjx_arm.envs.tasks.push import Push, PushConfig
+from mjx_arm.envs.tasks.reach import Reach, ReachConfig
 from mjx_arm.options import check_name
 from mjx_arm.references import is_reference, load_module
 
@@ -73,5 +75,7 @@ def task_names() -> list[str]:
 
 
 register("lift", Lift, config=LiftConfig)
+register("reach", Reach, config=ReachConfig, scene="arm_reach")
+register("push", Push, config=PushConfig, scene="arm_push")
 
 __all__: list[Any] = ["Task", "TaskConfig", "TaskEntry", "find_task", "register", "task_names"]

@@ -13,6 +13,7 @@ from mjx_arm.envs.collision import Obstacle
 from mjx_arm.envs.state import EnvState, Placement, Snapshot
 from mjx_arm.kinematics import Poses
 from mjx_arm.options import options
+from mjx_arm.render.geoms import SUPPORTED_TYPES, visible_geoms
 from mjx_arm.scene import Scene
 from mjx_arm.varies import Params, Varies
 
@@ -103,3 +104,32 @@ def rectangle(scene: Scene, name: str) -> tuple[np.ndarray, np.ndarray]:
             f"scene {scene.name!r}: numeric {name!r} must have half extents of 0 or more"
         )
     return values[:2], values[2:]
+
+
+def find_marker(scene: Scene, name: str, kind: str) -> int:
+    """Id of a geom that marks a place: it is visible and touches nothing.
+
+    Args:
+      scene: the scene.
+      name: of the geom.
+      kind: `"sphere"`, `"cylinder"`, ...
+
+    Raises:
+      ValueError: the scene has no such geom, or the geom is of another kind, on a body, invisible,
+        or has contacts.
+    """
+    model, geom = scene.mj_model, scene.find("geom", name)
+    where = f"scene {scene.name!r}: geom {name!r}"
+    if SUPPORTED_TYPES.get(int(model.geom_type[geom])) != kind:
+        raise ValueError(f"{where} must be a {kind}")
+    if model.geom_bodyid[geom] != 0:
+        raise ValueError(f"{where} must be in the worldbody, got a geom of a body")
+    in_pairs = geom in model.pair_geom1 or geom in model.pair_geom2
+    if model.geom_contype[geom] or model.geom_conaffinity[geom] or in_pairs:
+        raise ValueError(
+            f"{where} must have no contacts: set contype and conaffinity to 0, and name it in no "
+            "contact pair"
+        )
+    if not visible_geoms(model)[geom]:
+        raise ValueError(f"{where} must be visible: in a group from 0 to 2, with alpha above 0")
+    return geom
