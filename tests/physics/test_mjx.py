@@ -15,7 +15,7 @@ from physics_lab import scan_of
 
 from mjx_arm.physics import make_physics
 from mjx_arm.physics.mjx import make_mjx
-from mjx_arm.scene import load_scene, resolve_task
+from mjx_arm.scene import load_scene
 
 WITHOUT_WARP = importlib.util.find_spec("warp") is None
 
@@ -23,11 +23,12 @@ MANY = """
 import sys
 import jax, jax.numpy as jnp, numpy as np
 from mjx_arm.physics import make_physics
-from mjx_arm.scene import load_scene, resolve_task
+from mjx_arm.envs.arm import resolve_arm
+from mjx_arm.scene import load_scene
 
 envs = 256 * jax.device_count()
 scene = load_scene("arm_cube")
-ids = resolve_task(scene)
+ids = resolve_arm(scene)
 physics = make_physics(scene.mj_model, "mjx", substeps=2, mjx_iterations=(5, 8))
 qpos = jnp.asarray(np.tile(ids.home_qpos, (envs, 1)))
 ctrl = jnp.asarray(np.tile(ids.home_ctrl, (envs, 1)))
@@ -114,17 +115,17 @@ def test_the_scene_says_how_often_mjx_iterates(scene, ids, tmp_path):
         path = tmp_path / "scene.xml"
         path.write_text(text.replace(numeric, other))
         other_scene = load_scene(path)
-        iterations = tuple(resolve_task(other_scene).mjx_iterations)
+        iterations = other_scene.mjx_iterations
         physics = make_physics(other_scene.mj_model, "mjx", substeps=2, mjx_iterations=iterations)
         state = physics.init(jnp.asarray(ids.home_qpos), jnp.asarray(ids.home_ctrl))
         program = jax.jit(physics.step).lower(state, jnp.asarray(ids.home_ctrl)).as_text()
         loops[name] = program.count("stablehlo.while")
     assert loops["once"] == loops["as option"] - 1
-    assert resolve_task(scene).mjx_iterations.tolist() == [5, 8]
-    assert resolve_task(other_scene).mjx_iterations.tolist() == [10, 20]
+    assert scene.mjx_iterations == (5, 8)
+    assert other_scene.mjx_iterations == (10, 20)
     path.write_text(text.replace(numeric, numeric.replace("5 8", "5 0")))
-    with pytest.raises(ValueError, match="'mjx_iterations' must hold two counts from 1"):
-        resolve_task(load_scene(path))
+    with pytest.raises(ValueError, match="'mjx_iterations' must hold whole numbers of at least 1"):
+        load_scene(path).mjx_iterations  # noqa: B018
 
 
 def test_the_iterations_default_to_the_options_of_the_model(scene, ids):
