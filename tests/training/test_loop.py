@@ -15,6 +15,7 @@ from mjx_arm.algos.replay import sample
 from mjx_arm.config import TrainConfig, set_train_options, train_config
 from mjx_arm.options import get_option
 from mjx_arm.presets import PRESETS
+from mjx_arm.training import evaluate, runner
 from mjx_arm.training.loop import (
     EVALUATION,
     SELECTION,
@@ -215,19 +216,28 @@ def test_no_seed_of_a_training_meets_the_starts_that_judge_it():
             assert not keys & other
 
 
-@pytest.mark.parametrize("seed", [7, 1_000_003, 2_000_003])
-def test_a_training_never_starts_from_a_start_of_the_evaluation(seed):
-    from mjx_arm.training import runner
-    from mjx_arm.training.evaluate import _start as start_evaluation
-
+def test_a_training_never_starts_from_a_start_that_judges_it():
     options = {"env": "B", "observation": "state", "num_envs": 64, "placement": "always"}
-    trainer = make_trainer(with_options(CONFIG, seed=seed, **options))
-    trained = trainer.init(run_keys(trainer.config)).envs.env.physics.qpos
+    trainer = make_trainer(with_options(CONFIG, **options))
+    start_training = jax.jit(lambda key: trainer.init(key).envs.env.physics.qpos)
     auto = mjx_arm.AutoReset(trainer.env)
-    for role, judge in ((SELECTION, runner._SELECTION_SEED), (EVALUATION, runner._EVALUATION_SEED)):
-        judged = start_evaluation(auto, 64, role_key(judge, role)).envs.env.physics.qpos
-        rows = {tuple(row) for row in np.asarray(judged).tolist()}
-        assert not rows & {tuple(row) for row in np.asarray(trained).tolist()}
+    start_judging = jax.jit(lambda key: evaluate._start(auto, 64, key).envs.env.physics.qpos)
+
+    def rows(qpos: jax.Array) -> set[tuple[float, ...]]:
+        return {tuple(row) for row in np.asarray(qpos).tolist()}
+
+    judging = set()
+    for seed, role in (
+        (runner._SELECTION_SEED, SELECTION),
+        (runner._EVALUATION_SEED, EVALUATION),
+        (7, EVALUATION),  # that of the command `eval`
+    ):
+        starts = rows(start_judging(role_key(seed, role)))
+        assert len(starts) == 64
+        assert not judging & starts
+        judging |= starts
+    for seed in (0, 7, 1_000_003, 2_000_003):
+        assert not judging & rows(start_training(run_keys(with_options(CONFIG, seed=seed))))
 
 
 def test_seeds_side_by_side_have_the_keys_of_single_runs():

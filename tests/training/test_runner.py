@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import io
+import itertools
 import pathlib
 
 import flax.linen as nn
@@ -11,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.experimental.compilation_cache.compilation_cache import reset_cache
 from rich.console import Console
 
 import mjx_arm
@@ -20,6 +22,7 @@ from mjx_arm.config import set_train_options, train_config
 from mjx_arm.report.metrics import read_metrics
 from mjx_arm.training import runner
 from mjx_arm.training.checkpoint import RunCheckpoints
+from mjx_arm.training.evaluate import Evaluation, evaluate
 from mjx_arm.training.loop import make_trainer
 from mjx_arm.training.run_folder import load_run
 
@@ -34,8 +37,7 @@ CONFIG = train_config(
     total_steps=240,
     max_steps=15,
     hidden=16,
-    select_every=80,
-    select_episodes=2,
+    select_every=0,
 )
 
 
@@ -61,30 +63,56 @@ class Own(nn.Module):
 
 
 class OwnDQN(DQN):
-    """An algorithm of one's own."""
+    """An algorithm of one's own, with metrics of its own."""
+
+    def learn(self, key, learner, replay, env_steps):
+        usual = DQN(self.config, self.frames, self.q_learning, self.num_envs)
+        learner, sums = usual.learn(key, learner, replay, env_steps)
+        return learner, {"own": sums["loss"], "own_updates": sums["updates"]}
 
 
 def make_own(config, env) -> OwnDQN:
     learning = make_q_learning(config.algo, Own(), pixels=False)
-    return OwnDQN(config.algo, make_frames(env, "states"), learning, config.num_envs)
+    made = OwnDQN(config.algo, make_frames(env, "states"), learning, config.num_envs)
+    return dataclasses.replace(made, metrics={"own": "own_updates"})
 
 
-@pytest.fixture(autouse=True)
-def without_video(monkeypatch):
-    """What the tests of the command line look at, and what takes half of a run here."""
+class Nothing(list):
+    """An episode without frames."""
 
-    class Nothing(list):
-        success = False
+    success = False
 
-    def record_episode(env, apply, params, **options):
-        # It acts, in the environment and with the network of the run.
-        obs, _ = env.reset(jax.random.key(0))
-        assert apply(params, obs[None]).shape == (1, env.num_actions)
-        return Nothing()
 
-    monkeypatch.setattr(runner, "record_episode", record_episode)
-    monkeypatch.setattr(runner, "draw_episode", lambda env, episode: iter(()))
-    monkeypatch.setattr(runner, "write_video", lambda path, frames: None)
+def record_nothing(env, apply, params, **options):
+    """Instead of an episode for the video: one act, in the environment and by the network."""
+    del options
+    obs, _ = jax.jit(env.reset)(jax.random.key(0))
+    assert apply(params, obs[None]).shape == (1, env.num_actions)
+    return Nothing()
+
+
+def evaluate_nothing(env, apply, params, *, episodes, **options):
+    """Instead of the evaluation at the end, which compiles a program of its own."""
+    del env, apply, params, options
+    return Evaluation(episodes, 0, 0.0, (0.0, 1.0), 0.0, {})
+
+
+@pytest.fixture(autouse=True, scope="module")
+def quick_runs(tmp_path_factory):
+    """Without what the tests of the command line look at; a program is compiled only once."""
+    cache = tmp_path_factory.mktemp("cache")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(runner, "record_episode", record_nothing)
+        patch.setattr(runner, "draw_episode", lambda env, episode: iter(()))
+        patch.setattr(runner, "write_video", lambda path, frames: None)
+        patch.setattr(runner, "evaluate", evaluate_nothing)
+        jax.config.update("jax_compilation_cache_dir", str(cache))
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
+        reset_cache()
+        yield
+        jax.config.update("jax_compilation_cache_dir", None)
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 1.0)
+        reset_cache()
 
 
 def train(folder: pathlib.Path, config=CONFIG, **options):
@@ -100,16 +128,8 @@ def resume(folder: pathlib.Path, **options):
 @pytest.fixture(scope="module")
 def plain(tmp_path_factory) -> pathlib.Path:
     folder = tmp_path_factory.mktemp("runner") / "plain"
-    with pytest.MonkeyPatch.context() as patch:
-        for name in ("record_episode", "draw_episode"):
-            patch.setattr(runner, name, lambda *args, **options: Stub())
-        patch.setattr(runner, "write_video", lambda path, frames: None)
-        train(folder)
+    train(folder)
     return folder
-
-
-class Stub(list):
-    success = False
 
 
 def mean_rewards(folder: pathlib.Path) -> list[float]:
@@ -139,11 +159,16 @@ def test_an_own_reward_and_network_reach_training(tmp_path):
     assert [row["env_steps"] for row in read_metrics(folder)] == [80, 160, 240, 320]
 
 
-def test_an_own_environment_and_algorithm_reach_training(tmp_path):
+def test_an_own_environment_and_algorithm_reach_training(tmp_path, monkeypatch):
+    """As well as the selection, and the evaluation at the end."""
+    monkeypatch.setattr(runner, "evaluate", evaluate)
+    config = set_train_options(CONFIG, {"select_every": 80, "select_episodes": 2})
     folder = tmp_path / "run"
     options = {"physics": "native", "observation": "state", "max_steps": 9, "start": "in_grasp"}
     env = mjx_arm.make("B", reward=pay_seven, lift=0.25, **options)
-    (result,), _ = train(folder, env=env, algorithm=make_own)
+    (result,), _ = train(folder, config, env=env, algorithm=make_own)
+    assert all(np.isfinite(row["own"]) for row in read_metrics(folder)[1:])
+    assert "loss" not in read_metrics(folder)[0]
     # It is the one that judges, too: nothing takes 1,000 steps.
     assert result.mean_length <= 9
     assert mean_rewards(folder) == pytest.approx([7.0] * len(mean_rewards(folder)))
@@ -180,6 +205,8 @@ def test_own_parts_reach_a_trainer():
     assert trainer.env is env
     assert trainer.config.env == env.config
     assert isinstance(trainer.algorithm, OwnDQN)
+    _, counts = trainer.run_chunk(trainer.init(jax.random.key(0)))
+    assert counts["own_updates"] > 0
     with pytest.raises(ValueError, match="env= and reward= exclude each other"):
         make_trainer(CONFIG, env=env, reward=reward)
 
@@ -209,9 +236,10 @@ def test_on_chunk_sees_metrics_and_state_of_every_chunk(plain, tmp_path):
     ]
     assert repr(timeless[0]) == repr(timeless[1])
     last = mjx_arm.load_agent(folder / "last.safetensors")
-    shown = set_train_options(CONFIG, {"polyak": 0.0})
-    assert shown != CONFIG
     assert jax.tree.structure(last.params) == jax.tree.structure(seen[-1][2])
+    for before, after in itertools.pairwise(params for _, _, params in seen):
+        pairs = zip(*map(jax.tree.leaves, (before, after)), strict=True)
+        assert all((a != b).any() for a, b in pairs)
 
 
 def test_an_error_of_on_chunk_ends_the_run(tmp_path):
@@ -222,7 +250,7 @@ def test_an_error_of_on_chunk_ends_the_run(tmp_path):
         train(tmp_path / "run", on_chunk=on_chunk)
 
 
-def test_stop_at_ends_the_run_when_a_selection_reaches_it(plain, tmp_path, monkeypatch):
+def test_stop_at_ends_the_run_when_a_selection_reaches_it(tmp_path, monkeypatch):
     rates = iter([0.5, 0.8, 0.9])
 
     class Judged:
@@ -233,7 +261,8 @@ def test_stop_at_ends_the_run_when_a_selection_reaches_it(plain, tmp_path, monke
         runner, "make_evaluator", lambda *a, **o: lambda params, key: Judged(next(rates))
     )
     folder = tmp_path / "run"
-    _, said = train(folder, stop_at=0.75)
+    config = set_train_options(CONFIG, {"select_every": 80})
+    _, said = train(folder, config, stop_at=0.75)
     assert "stopped: every seed has reached 0.75" in said
     assert [row["selection_rate"] for row in read_metrics(folder)] == [0.5, 0.8]
     # It ended as any other run does, and can be resumed.

@@ -156,7 +156,7 @@ def test_a_closed_gripper_on_top_of_the_cube_has_not_grasped_it(env):
     model, arm, task = env.scene.mj_model, env.arm, env.task
     qpos = arm.home_qpos.copy()
     qpos[arm.finger_qpos] = arm.ctrl_range[arm.gripper_ctrl, 0]
-    _, state = env.reset(jax.random.key(0))
+    _, state = jax.jit(env.reset)(jax.random.key(0))
     poses = make_kinematics(model)(jnp.asarray(qpos))
     lowest = (
         float(np.min(poses.geom_xpos[task.pad_geoms, 2])) - model.geom_size[task.pad_geoms[0, 0], 0]
