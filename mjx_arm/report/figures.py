@@ -40,9 +40,11 @@ def plot_curves(folders: Sequence[pathlib.Path], into: pathlib.Path) -> list[pat
       ValueError: a folder holds no metrics.
     """
     runs = [_columns(folder) for folder in folders]
+    # A user's own algorithm need not have a loss.
+    learning = {name: title for name, title in _LEARNING.items() if name in runs[0]}
     return [
         _draw(into / "figure3.png", _PAPER, "episode", runs),
-        _draw(into / "learning.png", _LEARNING | _task_panels(runs[0]), "env_steps", runs),
+        _draw(into / "learning.png", learning | _task_panels(runs[0]), "env_steps", runs),
     ]
 
 

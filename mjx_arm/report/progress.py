@@ -51,10 +51,13 @@ def describe(rows: list[dict[str, float]]) -> str:
     parts = [
         f"{metrics['steps_per_s']:,.0f}/s",
         f"success {_percent(metrics['success_rate'])}",
-        f"max Q {metrics['q_mean']:.1f}",
-        f"loss {metrics['loss']:.3f}",
-        f"ε {metrics['epsilon']:.2f}",
     ]
+    # Not every algorithm has these.
+    if "q_mean" in metrics:
+        parts.append(f"max Q {metrics['q_mean']:.1f}")
+    if "loss" in metrics:
+        parts.append(f"loss {metrics['loss']:.3f}")
+    parts.append(f"ε {metrics['epsilon']:.2f}")
     return " ".join(parts)
 
 
