@@ -8,9 +8,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_arm.env import Env, EnvState
+from mjx_arm.envs.arm import Arm
+from mjx_arm.envs.env import Env
+from mjx_arm.envs.state import EnvState
 from mjx_arm.physics import compiler_options
-from mjx_arm.task import CLOSE, NUM_ACTIONS, OPEN
 
 Policy = Callable[[jax.Array, EnvState], jax.Array]
 
@@ -38,19 +39,25 @@ def succeeded(transitions) -> np.ndarray:
     return transitions.terminated.any(axis=0)
 
 
-def random_policy(key: jax.Array, state: EnvState) -> jax.Array:
-    del state
-    return jax.random.randint(key, (), 0, NUM_ACTIONS)
+def make_random_policy(arm: Arm) -> Policy:
+    """Takes every action with the same probability."""
+
+    def policy(key: jax.Array, state: EnvState) -> jax.Array:
+        del state
+        return jax.random.randint(key, (), 0, arm.num_actions)
+
+    return policy
 
 
-def make_pushing_policy(scripted: Callable[[EnvState], jax.Array]) -> Policy:
-    """Goes for the cube, but opens, shuts and turns at random on the way, which pushes it about."""
+def make_pushing_policy(arm: Arm, scripted: Callable[[EnvState], jax.Array]) -> Policy:
+    """Goes for the cube, but opens, closes and turns at random, which pushes the cube about."""
 
     def policy(key: jax.Array, state: EnvState) -> jax.Array:
         choose, which = jax.random.split(key)
-        draw = jax.random.uniform(choose)
-        gripper = jax.random.choice(which, jnp.asarray([OPEN, CLOSE, CLOSE], jnp.int32))
-        turn = jax.random.randint(which, (), 0, OPEN)
-        return jnp.where(draw < 0.05, gripper, jnp.where(draw < 0.4, turn, scripted(state)))
+        share = jax.random.uniform(choose)
+        close, opened = arm.close_action, arm.open_action
+        gripper = jax.random.choice(which, jnp.asarray([opened, close, close], jnp.int32))
+        turn = jax.random.randint(which, (), 0, opened)
+        return jnp.where(share < 0.05, gripper, jnp.where(share < 0.4, turn, scripted(state)))
 
     return policy

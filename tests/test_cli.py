@@ -1,12 +1,12 @@
 from __future__ import annotations
 
 import concurrent.futures
-import dataclasses
 import json
 import pathlib
 import subprocess
 import sys
 
+import flax.traverse_util
 import imageio.v3 as imageio
 import imageio_ffmpeg
 import jax
@@ -14,14 +14,34 @@ import numpy as np
 import pytest
 from tensorboardX.proto.event_pb2 import Event
 
-from mjx_arm.agent import load_agent, load_config, save_config
 from mjx_arm.cli import main
-from mjx_arm.config import PRESETS, TrainConfig
+from mjx_arm.config import (
+    TrainConfig,
+    dump_config,
+    parse_config,
+    set_train_options,
+    train_config,
+)
+from mjx_arm.options import flat_names
+from mjx_arm.presets import PRESETS
 from mjx_arm.report.metrics import read_metrics
-from mjx_arm.train import new_run_folder
+from mjx_arm.training.agent import load_agent, read_agent, save_agent
+from mjx_arm.training.run_folder import SavedRun, load_config, new_run_folder, save_run
 
 TINY = [
-    *("--physics", "native", "--num-envs", "4", "--size", "16", "16", "--replay-size", "400"),
+    *(
+        "--preset",
+        "pixels",
+        "--physics",
+        "native",
+        "--num-envs",
+        "4",
+        "--size",
+        "16",
+        "16",
+        "--replay-size",
+        "400",
+    ),
     *("--batch-size", "8", "--learning-starts", "40", "--chunk-steps", "200"),
     *("--total-steps", "400", "--max-steps", "25", "--hidden", "16", "--eval-episodes", "6"),
     *("--select-every", "200", "--select-episodes", "3"),
@@ -39,15 +59,15 @@ def test_a_run_leaves_everything(run_folder):
     names = {path.name for path in run_folder.iterdir()}
     assert names == {
         *("config.json", "metrics.jsonl", "tensorboard", "evaluation.json"),
-        *("last.agent", "best.agent"),
-        *("checkpoints",),
+        *("last.safetensors", "best.safetensors"),
+        *("checkpoints", ".lock"),
         *("figure3.png", "learning.png", "policy.mp4"),
     }
     rows = read_metrics(run_folder)
     assert [row["env_steps"] for row in rows] == [200, 400]
     assert json.loads((run_folder / "evaluation.json").read_text())["episodes"] == 6
     config = load_config(run_folder)
-    assert (config.total_steps, config.physics) == (400, "native")
+    assert (config.total_steps, config.env.physics) == (400, "native")
 
 
 def test_runs_that_start_in_the_same_second_have_folders_of_their_own(tmp_path, monkeypatch):
@@ -111,55 +131,71 @@ def test_the_agent_acts(run_folder):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--env", "C"], "unknown environment 'C'"),
-        (["--physics", "bullet"], "unknown physics 'bullet'"),
-        (["--num-envs", "0"], "num_envs is 0"),
-        (["--num-envs", "-3"], "num_envs is -3"),
-        (["--batch-size", "0"], "batch_size is 0"),
-        (["--replay-size", "32"], "replay_size is 32"),
-        (["--num-envs", "1", "--replay-size", "32"], "give at least batch_size = 64"),
+        (["--env", "C"], "env must be one of A, B, got 'C'"),
+        (["--physics", "bullet"], "physics must be one of auto, native, mjx, mjx-warp, got 'bull"),
+        (["--num-envs", "0"], "num_envs must be a whole number of at least 1, got 0"),
+        (["--num-envs", "-3"], "num_envs must be a whole number of at least 1, got -3"),
+        (["--batch-size", "0"], "batch_size must be a whole number of at least 1, got 0"),
+        (["--replay-size", "32"], "replay_size must be at least (n_step + 1) * num_envs = 384"),
+        (
+            ["--num-envs", "1", "--replay-size", "32"],
+            "replay_size must be at least batch_size = 64",
+        ),
         (["--replay-size", "100000000", "--storage", "pixels"], "give a smaller --replay-size"),
-        (["--replay-size", "1000000000000"], "replay_size is 1000000000000"),
+        (
+            ["--replay-size", "1000000000000"],
+            "replay_size must be a whole number of at least 1 and",
+        ),
         (["--reward", "candy"], "unknown reward 'candy'"),
+        (["--task", "pour"], "unknown task 'pour'"),
+        (["--algorithm", "sarsa"], "unknown algorithm 'sarsa'"),
         (["--scene", "kitchen"], "unknown scene 'kitchen'"),
-        (["--size", "0", "64"], "size is (0, 64)"),
+        (["--size", "0", "64"], "size must be a tuple of two values, each a whole number of at le"),
         (["--preset", "slow"], "unknown preset 'slow'"),
-        (["--preset"], "unknown preset None"),
+        (["--preset"], "preset"),
         (["--colour", "red"], "unknown options: --colour, red"),
-        (["--num-envs", "many"], "--num-envs: invalid literal for int()"),
-        (["--num-seeds", "0"], "num_seeds is 0"),
-        (["--select-every", "-1"], "select_every is -1"),
-        (["--eval-episodes", "0"], "eval_episodes is 0"),
-        (["--seed", "-1"], "seed is -1"),
-        (["--max-steps", "3000000000"], "max_steps is 3000000000: give at most"),
-        (["--epsilon-steps", "3000000000"], "epsilon_steps is 3000000000: give at most"),
-        (["--learning-starts", "200000000000"], "learning_starts is 200000000000: give at most"),
-        (["--learning-starts", "-1"], "learning_starts is -1: give at least 0"),
-        (["--gamma", "0"], "gamma is 0.0: give a number above 0"),
-        (["--seed", "2147483647", "--num-seeds", "2"], "seed is 2147483647"),
-        (["--total-steps", "3000000000"], "total_steps is 3000000000"),
-        (["--strides", "0", "1", "1"], "strides is (0, 1, 1)"),
-        (["--widths", "16", "0", "32"], "widths is (16, 0, 32)"),
-        (["--size", "4", "4"], "strides and pooling leave nothing of it"),
+        (["--num-envs", "many"], "num_envs must be a whole number of at least 1, got 'many'"),
+        (["--num-seeds", "0"], "num_seeds must be a whole number of at least 1, got 0"),
+        (["--select-every", "-1"], "select_every must be a whole number of at least 0, got -1"),
+        (["--eval-episodes", "0"], "eval_episodes must be at least 1, got 0"),
+        (["--stop-at", "1.5"], "stop_at must be above 0 and at most 1, got 1.5"),
+        (["--seed", "-1"], "seed must be a whole number of at least 0, got -1"),
+        (["--max-steps", "3000000000"], "max_steps must be a whole number of at least 1 and at mo"),
+        (["--epsilon-steps", "3000000000"], "at most 2147483647, got 3000000000"),
+        (["--learning-starts", "200000000000"], "at most 2147483647, got 200000000000"),
+        (["--learning-starts", "-1"], "learning_starts must be a whole number of at least 0, got"),
+        (["--gamma", "0"], "gamma must be a finite number above 0 and of at most 1, got 0.0"),
+        (["--gamma", "nan"], "gamma must be a finite number above 0 and of at most 1, got nan"),
+        (["--learning-rate", "inf"], "learning_rate must be a finite number above 0, got inf"),
+        (["--seed", "2147483647", "--num-seeds", "2"], "seed must be at most 2147483646, got 2147"),
+        (["--total-steps", "3000000000"], "total_steps must be a whole number from 1 to 20000000"),
+        (["--strides", "0", "1", "1"], "strides must be a tuple of three values, each a whole nu"),
+        (["--widths", "16", "0", "32"], "widths must be a tuple of three values, each a whole nu"),
+        (["--size", "4", "4"], "leave nothing of (4, 4)"),
+        (["--network", "nowhere:Net"], "network: module 'nowhere' cannot be imported"),
+        (["--reward", "nowhere:f"], "reward: module 'nowhere' cannot be imported"),
+        (["--config", "nowhere.json"], "nowhere.json cannot be read"),
+        (["--init-from", "nowhere"], "nowhere is not a run folder and not an agent"),
     ],
 )
 def test_bad_input_gets_one_sentence_and_status_2(arguments, message, capsys, tmp_path):
     folder = tmp_path / "run"
-    assert main(["train", "--out", str(folder), *arguments]) == 2
+    preset = [] if "--preset" in arguments or "--config" in arguments else ["--preset", "pixels"]
+    assert main(["train", "--out", str(folder), *preset, *arguments]) == 2
     error = capsys.readouterr().err
     assert message in error
     assert error.count("\n") == 1
     assert not folder.exists()
 
 
-@pytest.mark.parametrize("preset", ["fast", "smoke", "paper"])
+@pytest.mark.parametrize("preset", list(PRESETS))
 def test_help_shows_the_values_of_the_preset(preset, capsys):
     with pytest.raises(SystemExit) as exit_info:
         main(["train", "--preset", preset, "--help"])
     assert exit_info.value.code == 0
     text = " ".join(capsys.readouterr().out.replace("│", " ").split())
-    for field in dataclasses.fields(TrainConfig):
-        assert f"--{field.name.replace('_', '-')}" in text
+    for name in flat_names(PRESETS[preset]):
+        assert f"--{name.replace('_', '-')}" in text
     assert f"(default: {PRESETS[preset].total_steps})" in text
 
 
@@ -209,7 +245,7 @@ def test_eval_prints_json(run_folder, capsys):
     report = json.loads(capsys.readouterr().out)
     assert report["episodes"] == 5
     assert set(report) == {
-        *("episodes", "successes", "rate", "ci95", "mean_length", "grasp_rate", "regrasps"),
+        *("episodes", "successes", "rate", "ci95", "mean_length", "metrics"),
     }
 
 
@@ -235,7 +271,7 @@ def test_a_video_that_could_not_be_written_is_refused_first(
 
 
 def test_figures_of_a_run_without_metrics_are_refused(tmp_path, capsys):
-    save_config(tmp_path, TrainConfig())
+    save_run(tmp_path, SavedRun(TrainConfig(), {}, ""))
     # A process that was killed has left half a line.
     (tmp_path / "metrics.jsonl").write_text('{"env_steps": 20')
     assert main(["figures", str(tmp_path)]) == 2
@@ -253,10 +289,16 @@ def test_figures_draws_the_curves_again(run_folder, capsys):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--epsilon", "10"], "epsilon is 10.0: give 0 to 1"),
-        (["--epsilon", "nan"], "epsilon is nan: give 0 to 1"),
-        (["--seed", "100000000000000000000"], "seed is 100000000000000000000: give 0 to"),
-        (["--max-steps", "10000000000"], "max_steps is 10000000000: give at most"),
+        (["--epsilon", "10"], "epsilon must be from 0 to 1, got 10.0"),
+        (["--epsilon", "nan"], "epsilon must be from 0 to 1, got nan"),
+        (
+            ["--seed", "100000000000000000000"],
+            "seed must be from 0 to 2147483647, got 100000000000000000000",
+        ),
+        (
+            ["--max-steps", "10000000000"],
+            "max_steps must be a whole number of at least 1 and at most 2147483647, got",
+        ),
     ],
 )
 def test_bad_options_of_a_try_are_refused(
@@ -271,24 +313,38 @@ def test_bad_options_of_a_try_are_refused(
 
 
 @pytest.mark.parametrize("command", ["eval", "play", "figures"])
-def test_what_is_no_run_is_refused(command, tmp_path, capsys):
+def test_what_is_not_a_run_is_refused(command, tmp_path, capsys):
     assert main([command, str(tmp_path / "nothing")]) == 2
     error = capsys.readouterr().err
-    assert "is no run folder" in error
+    assert "is not a run folder" in error
     assert error.count("\n") == 1
 
 
 @pytest.mark.parametrize("command", ["eval", "play"])
-@pytest.mark.parametrize("damage", ["short", "foreign", "other network"])
-def test_a_file_that_is_no_agent_is_refused(command, damage, run_folder, tmp_path, capsys):
-    path = tmp_path / "some.agent"
-    content = (run_folder / "best.agent").read_bytes()
+@pytest.mark.parametrize("damage", ["short", "foreign", "flipped", "edited", "other network"])
+def test_a_file_that_is_not_an_agent_is_refused(command, damage, run_folder, tmp_path, capsys):
+    path = tmp_path / "some.safetensors"
+    content = (run_folder / "best.safetensors").read_bytes()
     if damage == "short":
         path.write_bytes(content[:-1000])
     elif damage == "foreign":
         path.write_bytes(b"PK\x03\x04 nothing of ours")
+    elif damage == "flipped":
+        path.write_bytes(content[:-1] + bytes([content[-1] ^ 1]))
+    elif damage == "edited":
+        path.write_bytes(content.replace(b'gamma\\": 0.99', b'gamma\\": 0.98'))
     else:
-        path.write_bytes(content.replace(b'"hidden": 16', b'"hidden": 32'))
+        # Metadata and digest are right, but the tensors are those of another network.
+        metadata, tensors = read_agent(run_folder / "best.safetensors")
+        config = parse_config(metadata["config"], "test")
+        save_agent(
+            path,
+            set_train_options(config, {"hidden": 32}),
+            flax.traverse_util.unflatten_dict(tensors, sep="/"),
+            scene=metadata["scene"],
+            objects={},
+            env_steps=0,
+        )
     assert main([command, str(path)]) == 2
     error = capsys.readouterr().err
     assert str(path) in error
@@ -296,7 +352,7 @@ def test_a_file_that_is_no_agent_is_refused(command, damage, run_folder, tmp_pat
 
 
 def test_the_best_agent_is_the_one_that_selection_found(run_folder):
-    best, last = load_agent(run_folder), load_agent(run_folder / "last.agent")
+    best, last = load_agent(run_folder), load_agent(run_folder / "last.safetensors")
     rates = {row["env_steps"]: row["selection_rate"] for row in read_metrics(run_folder)}
     assert rates == {200: 0.0, 400: 0.0}
     assert (best.selection_rate, best.env_steps) == (0.0, 400)
@@ -315,3 +371,40 @@ def test_seeds_have_folders_of_their_own(tmp_path, capsys):
     assert np.asarray(imageio.imread(folder / "figure3.png")).std() > 5
     assert main(["eval", str(folder), "--episodes", "2"]) == 2
     assert "seed-3" in capsys.readouterr().err
+
+
+def test_a_file_of_options_is_a_starting_point(run_folder, tmp_path):
+    """Any run's `config.json`, and what is said on the command line beside it."""
+    folder = tmp_path / "run"
+    arguments = ["--config", str(run_folder / "config.json"), "--seed", "9", "--eval-episodes", "2"]
+    assert main(["train", *arguments, "--total-steps", "200", "--out", str(folder)]) == 0
+    expected = set_train_options(load_config(run_folder), {"seed": 9, "total_steps": 200})
+    assert load_config(folder) == expected
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("{", "is not JSON: line 1"),
+        ("[]", "must hold one JSON object"),
+        ('{"env": "B", "lift": 0.3}', "was written by mjx_arm 0.1"),
+        ('{"format": 3}', "has the format 3; this version reads 2"),
+        (json.dumps(dump_config(train_config()) | {"num_env": 3}), "did you mean 'num_envs'?"),
+        (json.dumps(dump_config(train_config()) | {"num_envs": 2.5}), "num_envs must be a whole"),
+    ],
+)
+def test_a_file_of_options_that_does_not_fit_is_refused(content, message, tmp_path, capsys):
+    path = tmp_path / "config.json"
+    path.write_text(content)
+    assert main(["train", "--config", str(path), "--out", str(tmp_path / "run")]) == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert str(path) in error
+    assert error.count("\n") == 1
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_preset_and_a_file_exclude_each_other(run_folder, capsys):
+    path = str(run_folder / "config.json")
+    assert main(["train", "--config", path, "--preset", "fast"]) == 2
+    assert "--preset and --config exclude each other" in capsys.readouterr().err

@@ -35,7 +35,7 @@ def test_unknown_gpu_is_refused(gpu: str, venv: Path) -> None:
     assert f"GPU is cuda12 or cuda13, or left out for the CPU, and not '{gpu}'" in result.stderr
 
 
-@pytest.mark.parametrize("version", ["(3, 10)", "(3, 13)", None])
+@pytest.mark.parametrize("version", ["(3, 10)", "(3, 14)", None])
 def test_other_python_is_refused(version: str | None, venv: Path, tmp_path: Path) -> None:
     python = tmp_path / "python-other"
     if version is not None:
@@ -44,7 +44,7 @@ def test_other_python_is_refused(version: str | None, venv: Path, tmp_path: Path
         python.chmod(0o755)
     result = make("setup", f"PYTHON={python}", f"VENV={venv}")
     assert result.returncode == 2
-    assert f"Python 3.11 or 3.12 is needed, and '{python}' is neither" in result.stderr
+    assert f"Python 3.11, 3.12 or 3.13 is needed, and '{python}' is another" in result.stderr
     assert list(venv.iterdir()) == [venv / "pyvenv.cfg"]
 
 

@@ -72,7 +72,9 @@ def plot_curves(folders: Sequence[pathlib.Path], into: pathlib.Path) -> list[pat
     """
     runs = [_columns(folder) for folder in folders]
     names = [folder.name for folder in folders]
-    learning = (*_LEARNING, *_task_panels(runs[0]))
+    # A user's own algorithm need not have a loss.
+    learning = [panel for panel in _LEARNING if panel.column in runs[0]]
+    learning += _task_panels(runs[0])
     return [
         _draw(into / "figure3.png", _PAPER, "episode", runs, names),
         _draw(into / "learning.png", learning, "env_steps", runs, names),

@@ -137,7 +137,8 @@ class RunProgress:
         parts = [f"{metrics['steps_per_s']:,.0f} steps/s"]
         if not math.isnan(self._success.mean):
             parts.append(f"success {100 * self._success.mean:.0f} %")
-        parts.append(f"max Q {metrics['q_mean']:.1f}")
+        if "q_mean" in metrics:  # not every algorithm has it
+            parts.append(f"max Q {metrics['q_mean']:.1f}")
         parts.append(f"ε {metrics['epsilon']:.2f}")
         parts.append(f"{_minutes(seconds_left)} left")
         return ", ".join(parts)

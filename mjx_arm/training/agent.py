@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import hashlib
 import json
 import os
@@ -196,9 +197,10 @@ def load_agent(
     path: str | pathlib.Path,
     *,
     max_steps: int = 1_000,
+    env: str | Env | None = None,
     network: Any = None,
     reward: Any = None,
-    env: str | None = None,
+    algorithm: Any = None,
     scene: str | pathlib.Path | None = None,
     **options: Any,
 ) -> Agent:
@@ -211,9 +213,11 @@ def load_agent(
       path: an agent's file, or a run folder, of which the best agent is taken, or the last one
         where none was selected.
       max_steps: iterations until an episode is truncated.
+      env: `"A"` or `"B"`; by default the one that it was trained in. If the agent was trained in
+        an environment that was passed as an object, that object: it judges the agent as it is.
       network: the Flax module, if the agent was trained with one that was passed as an object.
       reward: the same for a reward.
-      env: `"A"` or `"B"`; by default the one that it was trained in.
+      algorithm: the same for an algorithm.
       scene: name or path of a scene, or `"stored"` for the one in the agent's file; by default the
         one that it was trained in, as long as that has not changed.
       **options: other options to change, such as `physics`.
@@ -227,24 +231,29 @@ def load_agent(
     path = find_agent(pathlib.Path(path))
     metadata, tensors = read_agent(path)
     trained = parse_config(metadata["config"], str(path))
-    objects = Objects(network=network, reward=reward)
+    own = env if isinstance(env, Env) else None
+    objects = Objects(env=own, network=network, reward=reward, algorithm=algorithm)
     check_record(json.loads(metadata["objects"]), trained, objects, str(path))
-    judged = evaluation_config(trained.env, env=env, max_steps=max_steps)
-    config = dataclasses.replace(trained, env=judged)
-    config = set_train_options(config, options)
-    if scene is not None and str(scene) != STORED:
-        config = set_train_options(config, {"scene": str(scene)})
     stored = SceneSource.from_json(json.loads(metadata["scene"]), str(path))
-    made = make_env(
-        config.env, reward=reward, scene=_find_scene(path, trained, config, stored, scene)
-    )
-    algorithm = make_algorithm(config, made, network)
-    params = _restore(path, algorithm, made, tensors)
+    if isinstance(env, Env):
+        if options:
+            raise ValueError(f"make env= with {', '.join(options)}, which it has options for")
+        config, made = dataclasses.replace(trained, env=env.config), env
+    else:
+        judged = evaluation_config(trained.env, env=env, max_steps=max_steps)
+        config = set_train_options(dataclasses.replace(trained, env=judged), options)
+        if scene is not None and str(scene) != STORED:
+            config = set_train_options(config, {"scene": str(scene)})
+        found = _find_scene(path, trained, config, stored, scene)
+        made = make_env(config.env, reward=reward, scene=found)
+    factory = functools.partial(make_algorithm, network=network)
+    learner: Algorithm = (algorithm or factory)(config, made)
+    params = _restore(path, learner, made, tensors)
     return Agent(
         config,
         trained.env,
         made,
-        algorithm,
+        learner,
         params,
         json.loads(metadata["env_steps"]),
         json.loads(metadata["selection_rate"]),

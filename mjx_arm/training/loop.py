@@ -86,7 +86,8 @@ def make_trainer(
 
     Args:
       config: the options.
-      env: an environment of one's own; by default that of the configuration.
+      env: an environment of one's own, whose options take the place of `config.env`; by default
+        that of the configuration.
       network: a Flax module `observations [B, ...] -> Q-values [B, A]`; by default the one that
         the configuration names.
       reward: a function as in `mjx_arm.make`; by default the one that the configuration names.
@@ -96,7 +97,7 @@ def make_trainer(
       ValueError: the environment or the network cannot be made.
     """
     body = make_body(config, env=env, network=network, reward=reward, algorithm=algorithm)
-    init, run_chunk = body.init, body.run_chunk
+    config, init, run_chunk = body.config, body.init, body.run_chunk
     if config.num_seeds > 1:
         init, run_chunk = jax.vmap(init), jax.vmap(run_chunk)
     own = body.env.env
@@ -161,7 +162,10 @@ def make_body(
     algorithm: Callable[[TrainConfig, Env], Algorithm] | None = None,
 ) -> Body:
     """Makes the body of the scan, for one seed; see `make_trainer`."""
+    if env is not None and reward is not None:
+        raise ValueError("env= and reward= exclude each other: make env with the reward")
     own = make_env(config.env, reward=reward) if env is None else env
+    config = dataclasses.replace(config, env=own.config)
     made = make_algorithm(config, own, network) if algorithm is None else algorithm(config, own)
     return Body(config, AutoReset(own), made)
 

@@ -43,6 +43,7 @@ from mjx_arm.training.agent import (
     STORED,
     add_evaluation,
     check_tensors,
+    differences,
     evaluation_config,
     find_agent,
     flatten_params,
@@ -153,7 +154,9 @@ def train(
     console = make_console() if console is None else console
     objects = Objects(env=env, network=network, reward=reward, algorithm=algorithm)
     trainer = _prepare(config, objects, console)
+    config = trainer.config
     recorded = record(config, objects)
+    start = None if init_from is None else _read_policy(trainer, pathlib.Path(init_from))
     folder = (
         new_run_folder(config.env.env) if folder is None else prepare_folder(pathlib.Path(folder))
     )
@@ -161,8 +164,9 @@ def train(
         console.print(f"run folder: {folder}", soft_wrap=True)
         run_chunk = _compile(trainer, console)
         state = trainer.init(run_keys(config))
-        if init_from is not None:
-            state = _start_from(trainer, state, pathlib.Path(init_from))
+        if start is not None:
+            learner = trainer.algorithm.with_policy(state.learner, start)
+            state = dataclasses.replace(state, learner=learner)
         run = SavedRun(_with_backend(config, trainer), recorded, trainer.env.scene.source)
         save_run(folder, run)
         loop = _Loop(trainer, run, run_chunk, folder, console, stop_at, on_chunk)
@@ -221,6 +225,7 @@ def resume(
     with locked(folder):
         console.print(f"run folder: {folder}", soft_wrap=True)
         trainer = _prepare(config, objects, console, scene)
+        _check_same_env(config, _with_backend(trainer.config, trainer), folder)
         checkpoints = RunCheckpoints(folder, saved.origin)
         saved_any = _has_saved(trainer, folder)
         vector_step = checkpoints.find_newest(_shapes(trainer)) if saved_any else 0
@@ -271,12 +276,17 @@ def _scene_of(folder: pathlib.Path, saved: SavedRun, objects: Objects) -> Scene:
     return compile_scene(name, source)
 
 
-def _start_from(trainer: Trainer, state: LoopState, path: pathlib.Path) -> LoopState:
-    """The state with the parameters of an agent."""
+def _check_same_env(saved: TrainConfig, given: TrainConfig, folder: pathlib.Path) -> None:
+    """Refuses an environment that is passed again with other options."""
+    for name, (was, now) in differences(saved.env, given.env).items():
+        raise ValueError(f"{folder} was made with an env= of {name} = {was}, got {now}")
+
+
+def _read_policy(trainer: Trainer, path: pathlib.Path) -> Any:
+    """The parameters of an agent, for each seed, to start a run from."""
     path = find_agent(path)
     tensors = read_agent(path)[1]
-    policy = trainer.algorithm.policy(state.learner)
-    flat = flatten_params(policy)
+    flat = flatten_params(trainer.algorithm.policy(_shapes(trainer).learner))
     seeds = () if trainer.config.num_seeds == 1 else (trainer.config.num_seeds,)
     shapes = {name: x.shape[len(seeds) :] for name, x in flat.items()}
     if {name: x.shape for name, x in tensors.items()} != shapes:
@@ -285,9 +295,7 @@ def _start_from(trainer: Trainer, state: LoopState, path: pathlib.Path) -> LoopS
         )
     check_tensors(path, tensors, {name: x.dtype for name, x in flat.items()})
     arrays = {name: jnp.broadcast_to(tensors[name], (*seeds, *shapes[name])) for name in flat}
-    params = flax.traverse_util.unflatten_dict(arrays, sep="/")
-    learner = trainer.algorithm.with_policy(state.learner, params)
-    return dataclasses.replace(state, learner=learner)
+    return flax.traverse_util.unflatten_dict(arrays, sep="/")
 
 
 def _check_options(eval_episodes: int, stop_at: float | None) -> None:
@@ -452,8 +460,11 @@ class _Loop:
 
     def _results(self, started: float) -> list[_Results]:
         config = self.trainer.config
-        env = self.trainer.env
-        judged = make_env(evaluation_config(config.env), reward=env.reward, scene=env.scene)
+        judged = self.trainer.env
+        if "env" not in self.saved.objects:
+            judged = make_env(
+                evaluation_config(config.env), reward=judged.reward, scene=judged.scene
+            )
         evaluator = make_evaluator(
             judged,
             self.trainer.algorithm.apply,
@@ -575,7 +586,8 @@ def _finish_seed(
     for path in plot_curves([folder], into=folder):
         console.print(f"curves: {path}", soft_wrap=True)
     console.print(f"evaluating: {eval_episodes} episodes")
-    agent = load_agent(folder, network=objects.network, reward=objects.reward, scene=STORED)
+    scene = None if objects.env is not None else STORED
+    agent = load_agent(folder, scene=scene, **objects.given())
     console.print(f"agent: {find_agent(folder)}, after {agent.env_steps:,} steps", soft_wrap=True)
     key = role_key(_EVALUATION_SEED, EVALUATION_ROLE)
     result = evaluate(

@@ -45,11 +45,15 @@ def test_the_cube_outlives_a_failed_episode_but_not_a_seed():
     assert (places[0] != places[3]).all()
 
 
-@pytest.mark.parametrize(("action", "message"), [(14, "action is 14"), (-1, "action is -1")])
-def test_actions_that_are_none_are_refused(action, message):
+@pytest.mark.parametrize(
+    ("action", "message"), [(14, "got 14"), (-1, "got -1"), (2.5, "got 2.5"), ([1, 2], "got")]
+)
+def test_invalid_actions_are_refused(action, message):
     env = mjx_arm.interop.ArmCubeEnv(**OPTIONS)
     env.reset(seed=0)
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(
+        ValueError, match=f"actions must be one whole number from 0 to 13, {message}"
+    ):
         env.step(action)
 
 
@@ -111,14 +115,37 @@ def test_a_vector_env_does_what_single_ones_do():
         np.testing.assert_allclose(reward, one_reward, atol=1e-6)
 
 
+def test_a_mask_restricts_the_reset_to_some_environments():
+    env = vector_env()
+    first, _ = env.reset(seed=0)
+    for _ in range(2):
+        moved, *_ = env.step(np.full(3, SHOULDER_UP))
+    mask = np.asarray([True, False, True])
+    obs, _ = env.reset(options={"reset_mask": mask})
+    np.testing.assert_allclose(obs[mask], first[mask], atol=1e-6)
+    np.testing.assert_array_equal(obs[~mask], moved[~mask])
+    # The other episode goes on where it was: it ends after its own four steps.
+    for _ in range(2):
+        _, _, _, truncated, _ = env.step(np.full(3, SHOULDER_UP))
+    assert truncated.tolist() == [False, True, False]
+    with pytest.raises(ValueError, match="reset_mask must be 3 booleans"):
+        env.reset(options={"reset_mask": np.ones(2, bool)})
+
+
+def test_each_task_is_registered():
+    for name in ("mjx_arm/LiftA-v0", "mjx_arm/LiftB-v0"):
+        env = gymnasium.make(name, observation="state", **OPTIONS).unwrapped
+        assert (env.env.config.task, env.env.config.env) == ("lift", name[-4])
+
+
 def test_bad_vector_options_are_refused():
-    with pytest.raises(ValueError, match="num_envs is 0"):
+    with pytest.raises(ValueError, match="num_envs must be at least 1, got 0"):
         mjx_arm.interop.ArmCubeVectorEnv(num_envs=0)
     with pytest.raises(ValueError, match="unknown auto-reset mode"):
         mjx_arm.interop.ArmCubeVectorEnv(autoreset="never")
     env = vector_env()
     env.reset(seed=0)
-    with pytest.raises(ValueError, match="give 3 integers"):
+    with pytest.raises(ValueError, match="actions must be 3 whole numbers from 0 to 13"):
         env.step(np.zeros(2, int))
 
 

@@ -4,8 +4,9 @@ from collections.abc import Iterator
 
 import pytest
 from physics_lab import BACKENDS, Lab, LongRun, make_lab, make_long_run
+from scene_ids import TaskIds, resolve_task
 
-from mjx_arm.scene import Scene, TaskIds, load_scene, resolve_task
+from mjx_arm.scene import Scene, load_scene
 
 
 @pytest.fixture(scope="session")

@@ -9,9 +9,10 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scene_ids import TaskIds, resolve_task
 
 from mjx_arm.physics import Physics, PhysicsState, compiler_options, make_physics
-from mjx_arm.scene import Scene, TaskIds, load_scene, resolve_task
+from mjx_arm.scene import Scene, load_scene
 
 # Compiling MJX takes half a minute on two busy cores: every test steps as many environments.
 NUM_ENVS = 12
@@ -61,7 +62,7 @@ def make_lab(backend: str) -> Lab:
     scene = load_scene("arm_cube")
     ids = resolve_task(scene)
     physics = make_physics(
-        scene.mj_model, backend, substeps=ids.substeps, mjx_iterations=tuple(ids.mjx_iterations)
+        scene.mj_model, backend, substeps=ids.substeps, mjx_iterations=ids.mjx_iterations
     )
     qpos = jnp.asarray(np.tile(ids.home_qpos, (NUM_ENVS, 1)))
     ctrl = jnp.asarray(np.tile(ids.home_ctrl, (NUM_ENVS, 1)))

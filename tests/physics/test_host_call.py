@@ -24,12 +24,13 @@ ONCE = """
 import sys
 import jax
 from mjx_arm.physics import make_physics
-from mjx_arm.scene import load_scene, resolve_task
+from mjx_arm.envs.arm import resolve_arm
+from mjx_arm.scene import load_scene
 jax.config.update("jax_compilation_cache_dir", sys.argv[1])
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
 events = []
 scene = load_scene("arm_cube")
-ids, physics = resolve_task(scene), make_physics(scene.mj_model, "native", substeps=2)
+ids, physics = resolve_arm(scene), make_physics(scene.mj_model, "native", substeps=2)
 state = physics.init(jax.numpy.asarray(ids.home_qpos), jax.numpy.asarray(ids.home_ctrl))
 jax.monitoring.register_event_listener(lambda name, **_: events.append(name))
 end = jax.jit(physics.step)(state, jax.numpy.asarray(ids.home_ctrl))

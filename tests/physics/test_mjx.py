@@ -16,7 +16,7 @@ from physics_lab import scan_of
 from mjx_arm.physics import make_physics
 from mjx_arm.physics import mjx as mjx_backend
 from mjx_arm.physics.mjx import make_mjx
-from mjx_arm.scene import load_scene, resolve_task
+from mjx_arm.scene import load_scene
 
 WITHOUT_WARP = importlib.util.find_spec("warp") is None
 
@@ -24,11 +24,12 @@ MANY = """
 import sys
 import jax, jax.numpy as jnp, numpy as np
 from mjx_arm.physics import make_physics
-from mjx_arm.scene import load_scene, resolve_task
+from mjx_arm.envs.arm import resolve_arm
+from mjx_arm.scene import load_scene
 
 envs = 256 * jax.device_count()
 scene = load_scene("arm_cube")
-ids = resolve_task(scene)
+ids = resolve_arm(scene)
 physics = make_physics(scene.mj_model, "mjx", substeps=2, mjx_iterations=(5, 8))
 qpos = jnp.asarray(np.tile(ids.home_qpos, (envs, 1)))
 ctrl = jnp.asarray(np.tile(ids.home_ctrl, (envs, 1)))
@@ -122,15 +123,15 @@ def test_the_iterations_are_those_given_or_those_of_the_model(scene, monkeypatch
 
 def test_the_scene_says_how_often_mjx_iterates(scene, tmp_path):
     text = (pathlib.Path(__file__).parents[2] / "xml/arm_cube.xml").read_text()
-    numeric = '<numeric name="mjx_iterations" data="5 8"/>'
+    numeric = '<numeric name="mjx_iterations" data="8 8"/>'
     assert text.count(numeric) == 1
-    assert resolve_task(scene).mjx_iterations.tolist() == [5, 8]
+    assert scene.mjx_iterations == (8, 8)
     path = tmp_path / "scene.xml"
     path.write_text(text.replace(numeric, ""))
-    assert resolve_task(load_scene(path)).mjx_iterations.tolist() == [10, 20]
-    path.write_text(text.replace(numeric, numeric.replace("5 8", "5 0")))
-    with pytest.raises(ValueError, match="'mjx_iterations' must hold two counts from 1"):
-        resolve_task(load_scene(path))
+    assert load_scene(path).mjx_iterations == (10, 20)
+    path.write_text(text.replace(numeric, numeric.replace("8 8", "5 0")))
+    with pytest.raises(ValueError, match="'mjx_iterations' must hold whole numbers of at least 1"):
+        load_scene(path).mjx_iterations  # noqa: B018
 
 
 @pytest.mark.parametrize("iterations", [(5,), (5, 0), (5.5, 8), (True, 8)])

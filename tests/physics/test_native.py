@@ -145,14 +145,15 @@ TWO_DEVICES = """
     import jax, jax.numpy as jnp, numpy as np
     from jax.sharding import NamedSharding, PartitionSpec as P
     from mjx_arm.physics import make_physics
-    from mjx_arm.scene import load_scene, resolve_task
+    from mjx_arm.envs.arm import resolve_arm
+    from mjx_arm.scene import load_scene
 
     assert jax.device_count() == 2
     scene = load_scene("arm_cube")
-    ids, physics = resolve_task(scene), make_physics(scene.mj_model, "native", substeps=2)
+    ids, physics = resolve_arm(scene), make_physics(scene.mj_model, "native", substeps=2)
     qpos = np.tile(ids.home_qpos, (8, 1))
     ctrl = np.tile(ids.home_ctrl, (8, 1))
-    ctrl[:, ids.arm_ctrl] += np.linspace(-0.3, 0.3, 8, dtype=np.float32)[:, None]
+    ctrl[:, ids.ctrl] += np.linspace(-0.3, 0.3, 8, dtype=np.float32)[:, None]
 
     def run(state, ctrl):
         step = lambda state, _: (jax.vmap(physics.step)(state, ctrl), None)
@@ -275,10 +276,11 @@ WITHOUT_JIT = """
     import threading
     import jax, jax.numpy as jnp
     from mjx_arm.physics import make_physics
-    from mjx_arm.scene import load_scene, resolve_task
+    from mjx_arm.envs.arm import resolve_arm
+    from mjx_arm.scene import load_scene
 
     scene = load_scene("arm_cube")
-    ids = resolve_task(scene)
+    ids = resolve_arm(scene)
 
     def work():
         physics = make_physics(scene.mj_model, "native", substeps=2)

@@ -19,7 +19,7 @@ _SHAPES = ("box", "sphere", "capsule", "cylinder")
 
 
 def scene_of(xml: str) -> Scene:
-    return Scene(name="test", mj_model=mujoco.MjModel.from_xml_string(xml))
+    return Scene(name="test", mj_model=mujoco.MjModel.from_xml_string(xml), xml=xml)
 
 
 def random_primitives(seed: int, count: int = 8, lights: str = "") -> Scene:

@@ -5,7 +5,7 @@ import pytest
 from rollouts import rollout, succeeded
 
 import mjx_arm
-from mjx_arm.scripted import make_scripted_policy
+from mjx_arm.envs.scripted import make_scripted_policy
 
 # The share of environment B's starts from which the task must be shown to be possible.
 LEAST_SUCCESS = 0.96
@@ -31,5 +31,5 @@ def test_lifts_the_cube_with_the_fourteen_actions(name, physics, num_envs):
     print(f"{name} {physics}: {share:.3f} of {num_envs} starts")
     assert share >= LEAST_SUCCESS
     done = np.argwhere(transitions.terminated)[0]
-    height = states.physics.qpos[tuple(done)][env.ids.cube_qpos + 2] - env.ids.cube_half_size
+    height = states.physics.qpos[tuple(done)][env.task.cube_qpos + 2] - env.task.half_size
     assert height >= 0.3

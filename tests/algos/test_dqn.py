@@ -8,8 +8,8 @@ import numpy as np
 import optax
 import pytest
 
-from mjx_arm.dqn import DQN, epsilon_greedy, half_square, huber, td_error, td_target
-from mjx_arm.replay import Batch, Step, add, init_replay, sample
+from mjx_arm.algos.dqn import QLearning, td_error, td_target
+from mjx_arm.algos.replay import Batch, Step, add, init_replay, sample
 
 GAMMA = 0.9
 
@@ -26,8 +26,46 @@ def test_target_and_error_by_hand():
     ("error", "expected", "square"), [(0.5, 0.125, 0.125), (-1.0, 0.5, 0.5), (3.0, 2.5, 4.5)]
 )
 def test_losses_by_hand(error, expected, square):
-    assert huber(jnp.float32(error)) == pytest.approx(expected)
-    assert half_square(jnp.float32(error)) == pytest.approx(square)
+    q = jnp.asarray([[1.0, 1.0 + error], [0.0, 0.0]])
+    batch = Batch(
+        frame=jnp.zeros(1),
+        next_frame=jnp.ones(1),
+        action=jnp.asarray([1]),
+        reward=jnp.asarray([1.0]),
+        discount=jnp.asarray([GAMMA]),
+        weight=jnp.asarray([1.0]),
+    )
+    for huber, loss in ((True, expected), (False, square)):
+        learning = dataclasses.replace(make_tabular(), huber=huber)
+        learner = dataclasses.replace(learning.init(jax.random.key(0), None), params=q)
+        learner = dataclasses.replace(learner, target_params=q)
+        _, metrics = learning.update(learner, batch, batch.frame, batch.next_frame)
+        assert metrics["loss"] == pytest.approx(loss)
+
+
+def test_a_masked_transition_with_nan_changes_nothing():
+    """Zero times NaN is NaN, so that a weight of 0 alone would not do."""
+    learning = dataclasses.replace(make_tabular(), apply=lambda params, obs: obs[:, None] * params)
+    learner = learning.init(jax.random.key(0), None)
+    learner = dataclasses.replace(
+        learner, params=jnp.asarray([0.3, -0.2]), target_params=jnp.asarray([0.1, 0.2])
+    )
+    learner = dataclasses.replace(learner, opt_state=learning.optimizer.init(learner.params))
+
+    def after(bad: float):
+        batch = Batch(
+            frame=jnp.asarray([1.0, bad]),
+            next_frame=jnp.asarray([0.5, bad]),
+            action=jnp.asarray([1, 0]),
+            reward=jnp.asarray([1.0, 0.0]),
+            discount=jnp.asarray([GAMMA, 0.0]),
+            weight=jnp.asarray([1.0, 0.0]),
+        )
+        return learning.update(learner, batch, batch.frame, batch.next_frame)
+
+    for one, other in zip(*map(jax.tree.leaves, (after(jnp.nan), after(0.0))), strict=True):
+        assert np.isfinite(one).all()
+        np.testing.assert_array_equal(one, other)
 
 
 def test_ranks_are_asserted():
@@ -35,14 +73,7 @@ def test_ranks_are_asserted():
         td_target(jnp.zeros(2), jnp.zeros(()), jnp.zeros(3), jnp.zeros(3))
 
 
-def test_epsilon_is_the_share_of_random_actions():
-    q = jnp.tile(jnp.asarray([0.0, 1.0, 0.0, 0.0]), (20_000, 1))
-    for epsilon in (0.0, 0.4, 1.0):
-        actions = np.asarray(epsilon_greedy(jax.random.key(0), q, jnp.float32(epsilon)))
-        assert (actions != 1).mean() == pytest.approx(0.75 * epsilon, abs=0.02)
-
-
-def test_an_update_in_parts_is_an_update():
+def test_an_update_in_microbatches_is_an_update():
     dqn = make_tabular(polyak=0.05)
     learner = dqn.init(jax.random.key(0), jnp.zeros(1))
     learner = dataclasses.replace(learner, target_params=learner.params + 1.0)
@@ -57,19 +88,20 @@ def test_an_update_in_parts_is_an_update():
         weight=jax.random.bernoulli(next(keys), 0.8, (32,)).astype(jnp.float32),
     )
     whole, parts = (
-        dataclasses.replace(dqn, parts=n).update(learner, batch, obs, next_obs) for n in (1, 4)
+        dataclasses.replace(dqn, microbatches=n).update(learner, batch, obs, next_obs)
+        for n in (1, 4)
     )
     for one, other in zip(jax.tree.leaves(whole), jax.tree.leaves(parts), strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-5, atol=1e-6)
 
 
-def make_tabular(polyak=0.0, target_period=20, double=True) -> DQN:
+def make_tabular(polyak=0.0, target_period=20, double=True) -> QLearning:
     """Q-values of two observations, 0 and 1, and two actions, from a table."""
 
     def apply(params, obs):
         return params[obs.astype(jnp.int32)]
 
-    return DQN(
+    return QLearning(
         apply=apply,
         init_params=lambda key, obs: 0.1 * jax.random.normal(key, (2, 2)),
         optimizer=optax.adam(0.05),
@@ -80,23 +112,23 @@ def make_tabular(polyak=0.0, target_period=20, double=True) -> DQN:
     )
 
 
-def probe(transition, *, n_step: int, dqn: DQN, length: int = 100) -> np.ndarray:
+def probe(transition, *, n_step: int, dqn: QLearning, length: int = 100) -> np.ndarray:
     """Learns the Q-values of a probe: `transition(obs, action) -> next, reward, end, cut`."""
     rng = np.random.default_rng(0)
     obs, over, replay = 0, False, None
     for _ in range(length):
         action = int(rng.integers(2))
         if over:
-            after, reward, end, cut, void = 0, 0.0, False, False, True
+            after, reward, end, cut, masked = 0, 0.0, False, False, True
         else:
-            (after, reward, end, cut), void = transition(obs, action), False
+            (after, reward, end, cut), masked = transition(obs, action), False
         step = Step(
             frame=jnp.asarray([obs], jnp.float32),
             action=jnp.asarray([action], jnp.uint8),
             reward=jnp.asarray([reward], jnp.float32),
             terminated=jnp.asarray([end]),
             truncated=jnp.asarray([cut]),
-            void=jnp.asarray([void]),
+            masked=jnp.asarray([masked]),
         )
         # 64 slots hold less than was written, so that the ring has wrapped around.
         replay = add(init_replay(step, 64) if replay is None else replay, step)

@@ -19,7 +19,7 @@ def short():
     return mjx_arm.make("B", physics="native", observation="state", max_steps=MAX_STEPS)
 
 
-def lifting(cube_moves: str) -> mjx_arm.Env:
+def lifting(placement: str) -> mjx_arm.Env:
     """Succeeds within some steps of the shoulder."""
     return mjx_arm.make(
         "B",
@@ -28,7 +28,7 @@ def lifting(cube_moves: str) -> mjx_arm.Env:
         start="in_grasp",
         joint_noise=0.0,
         lift=0.2,
-        cube_moves=cube_moves,
+        placement=placement,
     )
 
 
@@ -83,37 +83,37 @@ def test_a_reset_is_fresh(short):
     auto = mjx_arm.AutoReset(short)
     step = jax.jit(auto.step)
     _, state = jax.jit(auto.reset)(jax.random.key(0))
-    starts = [state.env.physics.qpos[short.ids.arm_qpos]]
+    starts = [state.env.physics.qpos[short.arm.qpos]]
     for count in range(3 * (MAX_STEPS + 1)):
         _, state, *_, info = step(jax.random.key(count), state, 3)
         if info["reset"]:
-            starts.append(state.env.physics.qpos[short.ids.arm_qpos])
+            starts.append(state.env.physics.qpos[short.arm.qpos])
     assert len(starts) == 4
     assert len(np.unique(np.asarray(starts), axis=0)) == 4
 
 
 @pytest.mark.parametrize(
-    ("cube_moves", "after_failure", "after_success"),
-    [("on_success", False, True), ("always", True, True), ("never", False, False)],
+    ("placement", "after_failure", "after_success"),
+    [("after_success", False, True), ("always", True, True), ("fixed", False, False)],
 )
-def test_the_cube_moves_when_it_should(short, cube_moves, after_failure, after_success):
+def test_the_cube_moves_when_it_should(short, placement, after_failure, after_success):
     failing = mjx_arm.make(
-        "B", physics="native", observation="state", max_steps=1, cube_moves=cube_moves
+        "B", physics="native", observation="state", max_steps=1, placement=placement
     )
     for env, action, length, moves in (
         (failing, 3, 2, after_failure),
-        (lifting(cube_moves), UP, LIFT_STEPS, after_success),
+        (lifting(placement), UP, LIFT_STEPS, after_success),
     ):
         auto = mjx_arm.AutoReset(env)
         step = jax.jit(auto.step)
         _, state = jax.jit(auto.reset)(jax.random.key(0))
-        place = np.asarray(state.env.cube_place)
+        place = np.asarray(state.env.placement)
         for count in range(length):
             _, state, _, _, _, info = step(jax.random.key(count), state, action)
             if info["reset"]:
                 break
         assert info["reset"]
-        assert (np.asarray(state.env.cube_place) != place).any() == moves
+        assert (np.asarray(state.env.placement) != place).any() == moves
 
 
 def test_unknown_mode_is_refused(short):

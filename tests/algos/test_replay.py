@@ -7,12 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjx_arm.replay import Step, add, init_replay, sample
+from mjx_arm.algos.replay import Step, add, init_replay, sample, sample_frames
 
 SLOTS, ENVS, GAMMA = 16, 3, 0.9
 
 
-def make_step(time: int, *, terminated=(), truncated=(), void=()) -> Step:
+def make_step(time: int, *, terminated=(), truncated=(), masked=()) -> Step:
     """Frame and reward say which slot they are of: 100 * environment + time."""
 
     def flags(which) -> jax.Array:
@@ -25,7 +25,7 @@ def make_step(time: int, *, terminated=(), truncated=(), void=()) -> Step:
         reward=frame,
         terminated=flags(terminated),
         truncated=flags(truncated),
-        void=flags(void),
+        masked=flags(masked),
     )
 
 
@@ -55,7 +55,7 @@ def test_samples_are_n_step_transitions(n_step, length):
 
 def test_a_termination_ends_the_sum_and_bootstraps_nothing():
     ends = {(5, 1)}
-    batch = sample(filled(12, terminated=ends, void={(6, 1)}), jax.random.key(1), 4000, 3, GAMMA)
+    batch = sample(filled(12, terminated=ends, masked={(6, 1)}), jax.random.key(1), 4000, 3, GAMMA)
     for start, expected in ((3, 103 + 0.9 * 104 + 0.81 * 105), (4, 104 + 0.9 * 105), (5, 105)):
         rows = np.flatnonzero(np.asarray(batch.frame) == 100 + start)
         assert len(rows) > 0
@@ -65,7 +65,9 @@ def test_a_termination_ends_the_sum_and_bootstraps_nothing():
 
 
 def test_a_truncation_bootstraps_from_the_true_last_frame():
-    batch = sample(filled(12, truncated={(5, 1)}, void={(6, 1)}), jax.random.key(1), 4000, 3, GAMMA)
+    batch = sample(
+        filled(12, truncated={(5, 1)}, masked={(6, 1)}), jax.random.key(1), 4000, 3, GAMMA
+    )
     for start, length in ((3, 3), (4, 2), (5, 1)):
         rows = np.flatnonzero(np.asarray(batch.frame) == 100 + start)
         np.testing.assert_array_equal(np.asarray(batch.next_frame)[rows], 106)
@@ -73,7 +75,9 @@ def test_a_truncation_bootstraps_from_the_true_last_frame():
 
 
 def test_no_transition_crosses_the_border_of_an_episode():
-    batch = sample(filled(12, truncated={(5, 1)}, void={(6, 1)}), jax.random.key(1), 4000, 3, GAMMA)
+    batch = sample(
+        filled(12, truncated={(5, 1)}, masked={(6, 1)}), jax.random.key(1), 4000, 3, GAMMA
+    )
     weight = np.asarray(batch.weight)
     frame = np.asarray(batch.frame)
     assert (weight[frame == 106] == 0.0).all()
@@ -82,7 +86,7 @@ def test_no_transition_crosses_the_border_of_an_episode():
 
 def test_a_diverged_step_reaches_no_transition():
     batch = sample(
-        filled(12, truncated={(5, 1)}, void={(5, 1), (6, 1)}), jax.random.key(1), 4000, 3, GAMMA
+        filled(12, truncated={(5, 1)}, masked={(5, 1), (6, 1)}), jax.random.key(1), 4000, 3, GAMMA
     )
     frame, weight = np.asarray(batch.frame), np.asarray(batch.weight)
     for start in (3, 4, 5, 6):
@@ -94,3 +98,10 @@ def test_adding_writes_in_place():
     replay = filled(3)
     compiled = jax.jit(add, donate_argnums=0).lower(replay, make_step(3)).compile()
     assert compiled.memory_analysis().alias_size_in_bytes >= replay.steps.reward.nbytes
+
+
+@pytest.mark.parametrize("length", [1, 9, 3 * SLOTS + 5])
+def test_sampled_frames_are_all_that_the_ring_holds(length):
+    frames = np.asarray(sample_frames(filled(length), jax.random.key(0), 2000), int)
+    times = range(max(0, length - SLOTS), length)
+    assert set(frames) == {100 * env + time for env in range(ENVS) for time in times}

@@ -1,8 +1,7 @@
-"""A run that goes on is the run that never stopped, to the bit."""
+"""A run that is resumed equals the run that never stopped, to the bit."""
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import os
 import pathlib
@@ -19,16 +18,19 @@ import jax
 import numpy as np
 import pytest
 
-from mjx_arm.agent import load_agent, load_config, save_config
-from mjx_arm.checkpoint import RunCheckpoints, load_tree, save_tree
 from mjx_arm.cli import main
-from mjx_arm.config import PRESETS
-from mjx_arm.loop import make_trainer
-from mjx_arm.memory import tree_size
+from mjx_arm.config import set_train_options
+from mjx_arm.presets import PRESETS
 from mjx_arm.report.metrics import read_metrics
+from mjx_arm.training.agent import load_agent
+from mjx_arm.training.checkpoint import RunCheckpoints, load_tree, save_tree
+from mjx_arm.training.loop import make_trainer, run_keys
+from mjx_arm.training.memory import tree_size
+from mjx_arm.training.run_folder import load_config, load_run, save_run
 
 OPTIONS = [
     # State features compile in a fraction of the time; the runs that are killed learn from pixels.
+    *("--preset", "pixels"),
     *("--observation", "state"),
     *("--physics", "native", "--num-envs", "4", "--size", "16", "16", "--replay-size", "400"),
     *("--batch-size", "8", "--learning-starts", "40", "--chunk-steps", "200"),
@@ -42,7 +44,7 @@ KILLS = 10
 
 def final_state(folder: pathlib.Path):
     config = load_config(folder)
-    like = jax.eval_shape(make_trainer(config).init, jax.random.key(0))
+    like = jax.eval_shape(make_trainer(config).init, run_keys(config))
     checkpoints = RunCheckpoints(folder)
     step = checkpoints.find_newest(like)
     state = checkpoints.load(step, like)
@@ -65,7 +67,7 @@ def assert_same_run(one: pathlib.Path, other: pathlib.Path) -> None:
         [{**row, "steps_per_s": 0, "wall_s": 0} for row in read_metrics(x)] for x in (one, other)
     ]
     assert repr(rows[0]) == repr(rows[1])
-    for name in ("last.agent", "best.agent"):
+    for name in ("last.safetensors", "best.safetensors"):
         agents = [load_agent(x / name) for x in (one, other)]
         assert agents[0].env_steps == agents[1].env_steps
         assert agents[0].selection_rate == agents[1].selection_rate
@@ -158,7 +160,7 @@ def test_damage_of_any_kind_is_found(damage, whole_run, tmp_path, capsys):
 def test_a_run_that_has_saved_nothing_yet_begins_again(whole_run, tmp_path):
     folder = tmp_path / "run"
     folder.mkdir()
-    save_config(folder, load_config(whole_run))
+    save_run(folder, load_run(whole_run))
     # Nine chunks of 200 steps, and half of the line of the tenth: there is nothing else yet.
     lines = (whole_run / "metrics.jsonl").read_text().splitlines(keepends=True)
     (folder / "metrics.jsonl").write_text("".join(lines[:9]) + lines[9][:20])
@@ -170,7 +172,7 @@ def test_a_run_whose_checkpoints_are_gone_does_not_begin_again(whole_run, tmp_pa
     folder = tmp_path / "run"
     shutil.copytree(whole_run, folder)
     shutil.rmtree(folder / "checkpoints")
-    assert_refused_and_untouched(folder, "holds no checkpoint to go on from", capsys)
+    assert_refused_and_untouched(folder, "holds no checkpoint to continue from", capsys)
 
 
 def test_a_short_run_whose_checkpoints_are_gone_does_not_begin_again(tmp_path, capsys):
@@ -178,10 +180,10 @@ def test_a_short_run_whose_checkpoints_are_gone_does_not_begin_again(tmp_path, c
     short = ["--total-steps", "400", "--out", str(folder)]
     assert main(["train", *OPTIONS, *short]) == 0
     shutil.rmtree(folder / "checkpoints")
-    assert_refused_and_untouched(folder, "holds no checkpoint to go on from", capsys)
+    assert_refused_and_untouched(folder, "holds no checkpoint to continue from", capsys)
 
 
-def test_one_seed_of_several_does_not_go_on_alone(tmp_path, capsys):
+def test_one_seed_of_several_is_not_resumed_alone(tmp_path, capsys):
     folder = tmp_path / "run"
     short = ["--total-steps", "400", "--num-seeds", "2", "--out", str(folder)]
     assert main(["train", *OPTIONS, *short]) == 0
@@ -208,30 +210,31 @@ def test_a_checkpoint_of_another_device_is_read(tmp_path):
 def test_fewer_steps_than_are_done_are_refused(whole_run, capsys):
     before = load_config(whole_run)
     assert main(["train", "--resume", str(whole_run), "--total-steps", "400"]) == 2
-    assert "--total-steps is 400: the run has made 4000 already" in capsys.readouterr().err
+    assert "--total-steps must be at least 4000, which the run has made" in capsys.readouterr().err
     assert load_config(whole_run) == before
 
 
 def test_what_holds_no_run_is_refused(tmp_path, capsys):
     assert main(["train", "--resume", str(tmp_path)]) == 2
-    assert "is no run folder" in capsys.readouterr().err
+    assert "is not a run folder" in capsys.readouterr().err
 
 
 def test_checkpoints_of_another_network_are_refused(whole_run):
-    config = dataclasses.replace(load_config(whole_run), hidden=17)
+    config = set_train_options(load_config(whole_run), {"hidden": 17})
     like = jax.eval_shape(make_trainer(config).init, jax.random.key(0))
     with pytest.raises(ValueError, match="is not a checkpoint of such a run"):
         RunCheckpoints(whole_run).load(RunCheckpoints(whole_run).steps()[-1], like)
 
 
 def test_checkpoints_are_small_however_full_the_replay():
-    for config in PRESETS.values():
-        state = jax.eval_shape(make_trainer(config).init, jax.random.key(0))
+    sizes = {}
+    for name in ("fast", "pixels", "smoke", "paper"):
+        state = jax.eval_shape(make_trainer(PRESETS[name]).init, jax.random.key(0))
         # Before compression, which does little for a full replay.
         assert tree_size(state) <= 300e6
-    # The last is the paper's, with its 500,000 transitions.
-    assert config.replay_size == 500_000
-    assert tree_size(state.replay) <= 100e6
+        sizes[name] = tree_size(state.replay)
+    assert PRESETS["paper"].replay.replay_size == 500_000
+    assert sizes["paper"] <= 100e6
 
 
 def test_a_full_disk_is_said_and_leaves_nothing_that_counts(tmp_path):
@@ -246,7 +249,7 @@ def test_a_full_disk_is_said_and_leaves_nothing_that_counts(tmp_path):
     assert "could not be written" in done.stderr
     assert done.stderr.count("\n") == 1
     assert RunCheckpoints(folder).steps() == []
-    assert not list(folder.glob("*.agent*"))
+    assert not list(folder.glob("*.safetensors*"))
 
 
 LATER = """
@@ -275,16 +278,16 @@ def test_a_disk_that_fills_up_leaves_the_last_whole_checkpoint(tmp_path):
     newest = RunCheckpoints(folder).newest()
     assert newest == f"{500:012d}"
     assert f"checkpoints/{1000:012d} could not be written" in done.stderr
-    assert f"--resume goes on from {newest}" in done.stderr
+    assert f"--resume continues from {newest}" in done.stderr
     assert done.stderr.count("\n") == 1
     assert not list(folder.glob("checkpoints/*tmp*"))
     # Room again.
     assert main(["train", "--resume", str(folder), "--eval-episodes", "4"]) == 0
-    assert load_agent(folder / "last.agent").env_steps == 4000
+    assert load_agent(folder / "last.safetensors").env_steps == 4000
 
 
 @pytest.mark.slow
-def test_a_killed_run_goes_on_to_the_same_bits(tmp_path):
+def test_a_killed_run_continues_to_the_same_bits(tmp_path):
     total = ("--total-steps", str(TOTAL_STEPS), "--observation", "packed")
     whole = tmp_path / "whole"
     started = time.monotonic()

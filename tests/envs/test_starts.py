@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 import mjx_arm
-from mjx_arm.start import MAX_DRAWS
+from mjx_arm.envs.starts import MAX_SAMPLES
 
-DRAWS = 10_000
-# At most this share of the draws may be rejected, or resets would be slow; 7 % are.
+STARTS = 10_000
+# At most this share of the samples may be rejected, or resets would be slow; 7 % are.
 MOST_REJECTED = 0.3
 
 
@@ -20,35 +20,36 @@ def env():
 
 @pytest.fixture(scope="module")
 def starts(env):
-    keys = jax.random.split(jax.random.key(7), DRAWS)
+    keys = jax.random.split(jax.random.key(7), STARTS)
     return jax.device_get(jax.jit(jax.vmap(lambda key: env.reset(key)[1]))(keys))
 
 
 def test_every_joint_spans_at_least_19_degrees_both_ways(env, starts):
-    home = env.ids.home_qpos[env.ids.arm_qpos]
-    offset = np.rad2deg(starts.physics.qpos[:, env.ids.arm_qpos] - home)
+    home = env.arm.home_qpos[env.arm.qpos]
+    offset = np.rad2deg(starts.physics.qpos[:, env.arm.qpos] - home)
     assert (offset.min(axis=0) <= -19.0).all()
     assert (offset.max(axis=0) >= 19.0).all()
     assert np.abs(offset).max() <= 20.001
 
 
 def test_the_cube_covers_200_square_centimetres(env, starts):
-    centre, half = env.ids.cube_rectangle[:2], env.ids.cube_rectangle[2:]
+    rectangle = env.scene.numbers("cube_rectangle", 4)
+    centre, half = rectangle[:2], rectangle[2:]
     assert 4 * half.prod() == pytest.approx(0.02)
-    offset = (starts.cube_place - centre) / half
+    offset = (starts.placement - centre) / half
     assert np.abs(offset).max() <= 1.0
     assert (offset.min(axis=0) < -0.99).all()
     assert (offset.max(axis=0) > 0.99).all()
     np.testing.assert_array_equal(
-        starts.physics.qpos[:, env.ids.cube_qpos : env.ids.cube_qpos + 2], starts.cube_place
+        starts.physics.qpos[:, env.task.cube_qpos : env.task.cube_qpos + 2], starts.placement
     )
 
 
-def test_few_draws_are_rejected_and_none_runs_out(starts):
-    rejected = 1 - DRAWS / starts.start_draws.sum()
-    print(f"rejected: {100 * rejected:.1f} % of {starts.start_draws.sum()} draws")
+def test_few_samples_are_rejected_and_none_runs_out(starts):
+    rejected = 1 - STARTS / starts.start_samples.sum()
+    print(f"rejected: {100 * rejected:.1f} % of {starts.start_samples.sum()} samples")
     assert rejected < MOST_REJECTED
-    assert starts.start_draws.max() < MAX_DRAWS
+    assert starts.start_samples.max() < MAX_SAMPLES
 
 
 def test_nothing_penetrates_anything(env, starts):
@@ -72,10 +73,10 @@ def test_nothing_penetrates_anything(env, starts):
         (a, b) for a, b in near if mujoco.mj_geomDistance(model, at_home, a, b, 0.01, points) > 0
     ]
     assert len(near) > 50
-    cube = {pair for pair in near if env.ids.cube_geom in pair}
+    cube = {pair for pair in near if env.task.cube_geom in pair}
     assert len(cube) > 10
     deepest = np.inf
-    for qpos in starts.physics.qpos[:: DRAWS // 1000]:
+    for qpos in starts.physics.qpos[:: STARTS // 1000]:
         data.qpos[:] = qpos
         mujoco.mj_kinematics(model, data)
         for a, b in near:
@@ -91,10 +92,10 @@ def test_lowest_point_of_all_starts_is_above_the_table(env, starts):
     assert lowest.min() > 0.0
 
 
-def test_nothing_is_drawn_where_no_start_is_needed(env):
-    draw = jax.jit(jax.vmap(env.starts.draw))
+def test_nothing_is_sampled_where_no_start_is_wanted(env):
+    sample = jax.jit(jax.vmap(env.starts.sample))
     keys = jax.random.split(jax.random.key(0), 4)
-    places = np.tile(env.ids.home_qpos[env.ids.cube_qpos : env.ids.cube_qpos + 2], (4, 1))
-    needed = np.asarray([True, False, False, True])
-    _, _, draws = draw(keys, places, needed)
-    np.testing.assert_array_equal(np.asarray(draws) > 0, needed)
+    places = np.tile(env.arm.home_qpos[env.task.cube_qpos : env.task.cube_qpos + 2], (4, 1))
+    wanted = np.asarray([True, False, False, True])
+    *_, samples = sample(keys, places, wanted)
+    np.testing.assert_array_equal(np.asarray(samples) > 0, wanted)

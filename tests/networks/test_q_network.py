@@ -1,13 +1,16 @@
 from __future__ import annotations
 
+import dataclasses
+
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjx_arm.convolution import max_pool
-from mjx_arm.networks import FeatureQNetwork, PatchConv, PixelQNetwork
+from mjx_arm.config import train_config
+from mjx_arm.networks.convolution import max_pool
+from mjx_arm.networks.q_network import FeatureQNetwork, PatchConv, PixelQNetwork, make_network
 
 
 @pytest.mark.parametrize(("kernel", "stride"), [(5, 2), (3, 1), (4, 2), (4, 3), (1, 1)])
@@ -67,3 +70,49 @@ def test_geom_ids_are_not_shown_to_the_network():
     params = network.init(jax.random.key(0), packed)
     marked = packed | jnp.uint32(7 << 24)
     np.testing.assert_array_equal(network.apply(params, packed), network.apply(params, marked))
+
+
+def test_both_convolutions_give_the_same_network():
+    config = train_config(widths=(4, 4, 4), hidden=16).network
+    packed = jax.random.bits(jax.random.key(0), (2, 32, 32), jnp.uint32)
+    values, params = [], None
+    for convolution in ("patches", "nn.Conv"):
+        chosen = dataclasses.replace(config, convolution=convolution)
+        network = make_network(chosen, num_actions=14, feature_scales=None)
+        params = network.init(jax.random.key(1), packed) if params is None else params
+        values.append(network.apply(params, packed))
+    np.testing.assert_allclose(values[0], values[1], rtol=1e-4, atol=1e-5)
+
+
+def test_several_cameras_are_channels():
+    network = PixelQNetwork(14, (4, 4, 4), (5, 3, 3), (2, 1, 1), 2, 16, False)
+    packed = jax.random.bits(jax.random.key(0), (2, 3, 32, 32), jnp.uint32)
+    params = network.init(jax.random.key(1), packed)
+    assert params["params"]["PatchConv_0"]["kernel"].shape == (5, 5, 9, 4)
+    q = network.apply(params, packed)
+    assert q.shape == (2, 14)
+    # Which camera shows an image matters.
+    assert (np.asarray(network.apply(params, packed[:, ::-1])) != np.asarray(q)).any()
+
+
+def test_features_are_scaled_before_they_are_used():
+    plain, scaled = FeatureQNetwork(14, 16, True), FeatureQNetwork(14, 16, True, (2.0, 0.5, 1.0))
+    x = jnp.asarray([[1.0, 2.0, 3.0]])
+    params = plain.init(jax.random.key(0), x)
+    expected = plain.apply(params, jnp.asarray([[2.0, 1.0, 3.0]]))
+    np.testing.assert_array_equal(scaled.apply(params, x), expected)
+
+
+@pytest.mark.parametrize(
+    ("network", "message"),
+    [
+        ("nowhere:Net", "network: module 'nowhere' cannot be imported"),
+        ("mjx_arm.networks:Nothing", "has no 'Nothing'"),
+        ("mjx_arm.networks:PixelQNetwork", "with the one attribute num_actions"),
+    ],
+)
+def test_a_network_that_cannot_be_made_is_refused(network, message):
+    config = train_config(network=network).network
+    with pytest.raises(ValueError, match=message) as raised:
+        make_network(config, num_actions=14, feature_scales=None)
+    assert "\n" not in str(raised.value)

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import inspect
 
 import jax
@@ -9,13 +10,16 @@ import numpy as np
 import pytest
 
 import mjx_arm
-from mjx_arm.config import ENVIRONMENTS
-from mjx_arm.task import CLOSE, OPEN
 
 
 @pytest.fixture(scope="module")
 def env():
     return mjx_arm.make("A", physics="native")
+
+
+@functools.cache
+def reset_once(env):
+    return jax.jit(env.reset)(jax.random.key(0))
 
 
 def structure(tree):
@@ -67,7 +71,7 @@ def test_rgbd_is_colour_and_depth():
 def test_the_image_shows_the_cube(env):
     packed = mjx_arm.make("A", physics="native", observation="segmentation")
     obs, _ = jax.jit(packed.reset)(jax.random.key(0))
-    assert (np.asarray(obs) == env.ids.cube_geom).sum() > 20
+    assert (np.asarray(obs) == env.task.cube_geom).sum() > 20
 
 
 def test_an_action_changes_what_is_seen(env):
@@ -79,9 +83,9 @@ def test_an_action_changes_what_is_seen(env):
 
 
 def test_environment_a_is_constant(env):
-    states = jax.vmap(lambda key: env.reset(key)[1])(jax.random.split(jax.random.key(0), 3))
-    qpos = np.asarray(states.physics.qpos)
-    np.testing.assert_array_equal(qpos, np.broadcast_to(env.ids.home_qpos, qpos.shape))
+    reset = jax.jit(jax.vmap(lambda key: env.reset(key)[1].physics.qpos))
+    qpos = np.asarray(reset(jax.random.split(jax.random.key(0), 3)))
+    np.testing.assert_array_equal(qpos, np.broadcast_to(env.arm.home_qpos, qpos.shape))
 
 
 def test_an_episode_is_truncated_after_max_steps_and_not_before():
@@ -89,7 +93,7 @@ def test_an_episode_is_truncated_after_max_steps_and_not_before():
     _, state = jax.jit(env.reset)(jax.random.key(0))
     step, flags = jax.jit(env.step), []
     for _ in range(4):
-        _, state, _, terminated, truncated, _ = step(jax.random.key(0), state, OPEN)
+        _, state, _, terminated, truncated, _ = step(jax.random.key(0), state, env.arm.open_action)
         flags.append((bool(terminated), bool(truncated)))
     assert flags == [(False, False), (False, False), (False, True), (False, True)]
 
@@ -119,21 +123,21 @@ def test_start_in_grasp_holds_the_cube_and_open_drops_it():
     _, state = jax.jit(jax.vmap(env.reset))(keys)
     step = jax.jit(jax.vmap(env.transition))
     for _ in range(30):
-        state, transition = step(state, jnp.full(16, CLOSE))
-    assert transition.info["grasped"].all()
-    height = np.asarray(transition.info["height"])
+        state, transition = step(state, jnp.full(16, env.arm.close_action))
+    assert transition.metrics["grasped"].all()
+    height = np.asarray(transition.metrics["height"])
     for _ in range(10):
-        state, transition = step(state, jnp.full(16, OPEN))
-    assert not transition.info["grasped"].any()
-    assert (np.asarray(transition.info["height"]) < height - 0.02).all()
+        state, transition = step(state, jnp.full(16, env.arm.open_action))
+    assert not transition.metrics["grasped"].any()
+    assert (np.asarray(transition.metrics["height"]) < height - 0.02).all()
 
 
 def test_two_keys_give_two_starts_in_b():
     env = mjx_arm.make("B", physics="native", observation="state")
     reset = jax.jit(env.reset)
     one, other = reset(jax.random.key(0))[1], reset(jax.random.key(1))[1]
-    assert (one.physics.qpos[env.ids.arm_qpos] != other.physics.qpos[env.ids.arm_qpos]).all()
-    assert (one.cube_place != other.cube_place).all()
+    assert (one.physics.qpos[env.arm.qpos] != other.physics.qpos[env.arm.qpos]).all()
+    assert (one.placement != other.placement).all()
 
 
 def test_a_diverged_simulation_ends_its_own_episode_only():
@@ -154,8 +158,8 @@ def test_a_diverged_simulation_ends_its_own_episode_only():
 
 
 @pytest.mark.parametrize("action", [-1, 14, 2.0, "up", [0, 1]])
-def test_an_action_that_is_none_is_refused(env, action):
-    _, state = env.reset(jax.random.key(0))
+def test_an_invalid_action_is_refused(env, action):
+    _, state = reset_once(env)
     with pytest.raises(ValueError, match="0 to 13"):
         env.step(jax.random.key(0), state, action)
 
@@ -163,15 +167,17 @@ def test_an_action_that_is_none_is_refused(env, action):
 @pytest.mark.parametrize(
     ("name", "options", "message"),
     [
-        ("C", {}, "unknown environment 'C': give one of A, B"),
-        ("A", {"physics": "bullet"}, "unknown physics 'bullet'"),
+        ("C", {}, "env must be one of A, B, got 'C'"),
+        ("A", {"physics": "bullet"}, "physics must be one of auto, native, .* got 'bullet'"),
         ("A", {"colour": "red"}, "unknown option 'colour'"),
-        ("A", {"observation": "smell"}, "unknown observation 'smell'"),
-        ("A", {"reward": "candy"}, "unknown reward 'candy'"),
-        ("A", {"size": (0, 64)}, "size is"),
-        ("A", {"max_steps": 0}, "max_steps is 0"),
-        ("A", {"joint_noise": 90.0}, "joint_noise is 90.0"),
+        ("A", {"observation": "smell"}, "observation must be one of rgb, .* got 'smell'"),
+        ("A", {"reward": "candy"}, "unknown reward 'candy': known are paper, completion"),
+        ("A", {"task": "pour"}, "unknown task 'pour'"),
+        ("A", {"size": (0, 64)}, r"size must be a tuple of two values, .* got \(0, 64\)"),
+        ("A", {"max_steps": 0}, "max_steps must be a whole number of at least 1, got 0"),
+        ("A", {"joint_noise": 90.0}, "joint_noise must be from 0 to 45 degrees, got 90.0"),
         ("A", {"camera": "back"}, "back"),
+        ("A", {"camera": ()}, "camera must name at least one camera"),
         ("A", {"scene": "kitchen"}, "unknown scene 'kitchen'"),
     ],
 )
@@ -185,19 +191,22 @@ def test_a_scene_without_the_names_of_the_task_is_refused(tmp_path):
     path = tmp_path / "ball.xml"
     path.write_text('<mujoco><worldbody><geom type="sphere" size="1"/></worldbody></mujoco>')
     assert mjx_arm.load_scene(path).mj_model.ngeom == 1
-    with pytest.raises(ValueError, match="6 joint servos and one named 'gripper'"):
+    with pytest.raises(
+        ValueError, match="at least one servo of a joint, and one actuator named 'gripper'"
+    ):
         mjx_arm.make("A", scene=str(path))
 
 
 def test_the_environments_are_the_papers():
-    assert ENVIRONMENTS["A"] == {"joint_noise": 0.0, "cube_moves": "never"}
-    assert ENVIRONMENTS["B"] == {"joint_noise": 20.0, "cube_moves": "on_success"}
+    a, b = mjx_arm.EnvConfig(env="A"), mjx_arm.EnvConfig(env="B")
+    assert (a.noise_degrees, a.placed) == (0.0, "fixed")
+    assert (b.noise_degrees, b.placed) == (20.0, "after_success")
 
 
 def test_configuration_is_frozen():
     config = mjx_arm.EnvConfig()
     with pytest.raises(dataclasses.FrozenInstanceError):
-        config.lift = 1.0
+        config.env = "B"
 
 
 def test_public_names_are_documented():

@@ -1,0 +1,207 @@
+from __future__ import annotations
+
+import pathlib
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from rollouts import make_pushing_policy, make_random_policy, rollout
+
+import mjx_arm
+from mjx_arm.envs.scripted import make_scripted_policy
+from mjx_arm.envs.state import Snapshot
+from mjx_arm.envs.tasks.lift import LiftConfig, completion_reward, grasped, paper_reward
+from mjx_arm.kinematics import make_kinematics
+
+GAMMA = 0.99
+LIFT = 0.3
+# A force that counts as a touch, N; the cube weighs 0.8 N.
+TOUCH_FORCE = 0.1
+LEAST_PRECISION = 0.98
+LEAST_RECALL = 0.98
+REWARDS = {"paper": paper_reward, "completion": completion_reward}
+SCENE = pathlib.Path(__file__).parents[3] / "xml" / "arm_cube.xml"
+
+
+def snapshot(*, distance=0.1, height=0.0, grasped=False, success=False) -> Snapshot:
+    measured = {
+        "distance": jnp.float32(distance),
+        "height": jnp.float32(height),
+        "grasped": jnp.asarray(grasped),
+        "success": jnp.asarray(success),
+    }
+    return Snapshot(None, measured)
+
+
+def total(kind: str, config: LiftConfig | None = None, **situation) -> float:
+    after = snapshot(**situation)
+    config = LiftConfig() if config is None else config
+    terms = REWARDS[kind](config, snapshot(), after, jnp.int32(0))
+    assert set(terms) == {"reach", "grasp", "lift", "success"}
+    assert all((term.shape, term.dtype) == ((), jnp.float32) for term in terms.values())
+    return float(sum(terms.values()))
+
+
+@pytest.mark.parametrize(
+    ("situation", "expected"),
+    [
+        ({"distance": 0.0}, 1.0),
+        ({"distance": 0.4}, np.exp(-0.25 * 4.0)),
+        ({"grasped": True, "height": 0.0}, 1.0),
+        ({"grasped": True, "height": 0.2}, 1.2),
+        ({"grasped": True, "height": 0.3, "success": True}, 100.0),
+    ],
+)
+def test_paper_is_algorithm_1(situation, expected):
+    assert total("paper", **situation) == pytest.approx(expected, rel=1e-6)
+
+
+def test_units_of_the_paper_are_options():
+    config = LiftConfig(distance_unit=1.0, height_unit=0.01, distance_decay=0.5)
+    assert total("paper", config, distance=2.0) == pytest.approx(np.exp(-1.0))
+    assert total("paper", config, grasped=True, height=0.2) == pytest.approx(21.0)
+
+
+@pytest.mark.parametrize(("kind", "hovering_wins"), [("paper", True), ("completion", False)])
+def test_only_the_papers_reward_prefers_to_hover(kind, hovering_wins):
+    hovering = total(kind, grasped=True, height=0.2999) / (1 - GAMMA)
+    success = total(kind, grasped=True, height=LIFT, success=True)
+    assert (hovering > success) == hovering_wins
+
+
+def test_completion_grows_on_the_way():
+    way = [
+        total("completion", distance=0.3),
+        total("completion", distance=0.1),
+        total("completion", distance=0.0),
+        total("completion", distance=0.0, grasped=True),
+        total("completion", distance=0.0, grasped=True, height=0.15),
+        total("completion", distance=0.0, grasped=True, height=0.29),
+    ]
+    assert way == sorted(way)
+    assert len(set(way)) == len(way)
+    assert way[-1] <= 0.8
+
+
+@pytest.mark.parametrize("start", ["home", "in_grasp"])
+def test_scale_scales_every_term(start):
+    options = {"physics": "native", "observation": "state", "reward": "completion", "start": start}
+    plain = mjx_arm.make("A", **options)
+    scaled = mjx_arm.make("A", reward_scale=0.2, **options)
+    _, state = jax.jit(plain.reset)(jax.random.key(0))
+    one, other = (jax.jit(env.transition)(state, 3)[1] for env in (plain, scaled))
+    assert other.reward == pytest.approx(0.2 * one.reward)
+    terms = [name for name in one.info if name.startswith("reward_")]
+    assert len(terms) == 4
+    for name in terms:
+        assert other.info[name] == pytest.approx(0.2 * one.info[name])
+    assert one.reward == pytest.approx(sum(one.info[name] for name in terms))
+    assert one.reward > 0
+
+
+@pytest.mark.parametrize("name", ["distance_unit", "height_unit", "distance_decay", "lift"])
+def test_constants_out_of_their_domain_are_refused(name):
+    with pytest.raises(ValueError, match=f"{name} must be a finite number above 0, got 0.0"):
+        LiftConfig(**{name: 0.0})
+
+
+@pytest.fixture(scope="module")
+def env():
+    return mjx_arm.make("B", physics="native", observation="state", placement="always")
+
+
+def finger_forces(env, states) -> np.ndarray:
+    """Sums of the contact forces of each finger on the cube, by MuJoCo C: `[L * N, 2]`, N."""
+    model, pads = env.scene.mj_model, [set(row) for row in env.task.pad_geoms]
+    data, force = mujoco.MjData(model), np.zeros(6)
+    qpos = states.physics.qpos.reshape(-1, model.nq)
+    qvel = states.physics.qvel.reshape(-1, model.nv)
+    ctrl = states.ctrl.reshape(-1, model.nu)
+    totals = np.zeros((len(qpos), 2))
+    for row in range(len(qpos)):
+        data.qpos[:], data.qvel[:], data.ctrl[:] = qpos[row], qvel[row], ctrl[row]
+        mujoco.mj_forward(model, data)
+        for index in range(data.ncon):
+            geoms = set(data.contact[index].geom)
+            for finger in range(2):
+                if env.task.cube_geom in geoms and geoms & pads[finger]:
+                    mujoco.mj_contactForce(model, data, index, force)
+                    totals[row, finger] += force[0]
+    return totals
+
+
+def test_grasped_agrees_with_the_contact_forces(env):
+    scripted = make_scripted_policy(env)
+    held = mjx_arm.make("B", physics="native", observation="state", start="in_grasp")
+    cases = {
+        "scripted": (env, lambda key, state: scripted(state)),
+        "random": (held, make_random_policy(held.arm)),
+        "pushing": (env, make_pushing_policy(env.arm, scripted)),
+    }
+    predicted, actual = [], []
+    for used, policy in cases.values():
+        states, transitions = rollout(used, policy, num_envs=32, length=250, seed=5)
+        predicted.append(transitions.metrics["grasped"].reshape(-1))
+        actual.append((finger_forces(used, states) > TOUCH_FORCE).all(axis=1))
+        assert actual[-1].sum() > 200
+    predicted, actual = np.concatenate(predicted), np.concatenate(actual)
+    both = (predicted & actual).sum()
+    assert both / predicted.sum() >= LEAST_PRECISION
+    assert both / actual.sum() >= LEAST_RECALL
+
+
+def test_a_closed_gripper_on_top_of_the_cube_has_not_grasped_it(env):
+    model, arm, task = env.scene.mj_model, env.arm, env.task
+    qpos = arm.home_qpos.copy()
+    qpos[arm.finger_qpos] = arm.ctrl_range[arm.gripper_ctrl, 0]
+    _, state = jax.jit(env.reset)(jax.random.key(0))
+    poses = make_kinematics(model)(jnp.asarray(qpos))
+    lowest = (
+        float(np.min(poses.geom_xpos[task.pad_geoms, 2])) - model.geom_size[task.pad_geoms[0, 0], 0]
+    )
+    cube = poses.geom_xpos.at[task.cube_geom].set(
+        poses.site_xpos[arm.grasp_site].at[2].set(lowest - task.half_size + 1e-4)
+    )
+    poses = poses.replace(geom_xpos=cube)
+    closed = state.ctrl.at[arm.gripper_ctrl].set(arm.ctrl_range[arm.gripper_ctrl, 0])
+    assert not grasped(task, poses, closed)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("cube_rectangle", "cube_place", "no numeric named 'cube_rectangle'"),
+        ('name="left_pad_0"', 'name="left_pad"', "geom|left_pad"),
+    ],
+)
+def test_a_scene_without_what_the_task_needs_is_refused_by_name(tmp_path, old, new, message):
+    text = SCENE.read_text()
+    assert old in text
+    path = tmp_path / "scene.xml"
+    path.write_text(text.replace(old, new))
+    with pytest.raises(ValueError, match=message):
+        mjx_arm.make("A", scene=str(path))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"type": mujoco.mjtGeom.mjGEOM_SPHERE}, "a box of three equal edges"),
+        ({"size": [0.03, 0.02, 0.02]}, "a box of three equal edges"),
+        ({"pos": [0.0, 0.0, 0.01]}, "at the origin of its body"),
+        ({"size": [0.001] * 3}, "on the ground at height 0"),
+    ],
+)
+def test_another_body_than_a_cube_is_refused_by_name(tmp_path, change, message):
+    spec = mujoco.MjSpec.from_file(str(SCENE))
+    cube = spec.geom("cube")
+    for name, value in change.items():
+        setattr(cube, name, value)
+    spec.compile()
+    path = tmp_path / "scene.xml"
+    path.write_text(spec.to_xml())
+    with pytest.raises(ValueError, match=message) as raised:
+        mjx_arm.make("A", scene=str(path))
+    assert "\n" not in str(raised.value)
