@@ -16,8 +16,9 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 
 _SECONDS_BETWEEN_LINES = 30.0
-# Episodes that the shown success rate averages over.
-_SMOOTHING = 200.0
+# Episodes that the shown success rate averages over, and chunks that the speed does.
+_EPISODES = 200.0
+_CHUNKS = 10.0
 
 
 class _Lossy:
@@ -81,8 +82,8 @@ class RunProgress:
 
     def __init__(self, console: Console, total: int, done: int = 0):
         self._console, self._total, self._done = console, total, done
-        self._success = _Smoothed()
-        self._speed = _Smoothed()
+        self._success = _Smoothed(_EPISODES)
+        self._speed = _Smoothed(_CHUNKS)
         self._last_line = -math.inf
         self._bar = Progress(
             TextColumn("{task.completed:,.0f} of {task.total:,.0f} ({task.percentage:.0f} %)"),
@@ -145,15 +146,15 @@ class RunProgress:
 
 
 class _Smoothed:
-    """A weighted mean of the newest values, over a weight of about 200."""
+    """A weighted mean of the newest values, over a weight of about `window`."""
 
-    def __init__(self) -> None:
-        self._sum, self._weight = 0.0, 0.0
+    def __init__(self, window: float) -> None:
+        self._window, self._sum, self._weight = window, 0.0, 0.0
 
     def add(self, value: float, weight: float) -> None:
         if math.isnan(value) or weight <= 0.0:
             return
-        keep = math.exp(-weight / _SMOOTHING)
+        keep = math.exp(-weight / self._window)
         self._sum = keep * self._sum + weight * value
         self._weight = keep * self._weight + weight
 
