@@ -58,5 +58,5 @@ def test_the_mean_over_environments_is_epsilon(num_envs, spread):
 
 @pytest.mark.parametrize("epsilon", [-0.1, 1.1, float("nan")])
 def test_what_is_no_share_is_refused(epsilon):
-    with pytest.raises(ValueError, match="epsilon must be from 0 to 1, got"):
+    with pytest.raises(ValueError, match="epsilon must be a finite number from 0 to 1, got"):
         check_epsilon(epsilon)
