@@ -227,6 +227,11 @@ def test_scenes_that_do_not_fit_are_refused_by_name(tmp_path, changes, message):
         mjx_arm.make(task="reach", scene=path)
 
 
+def test_the_arm_may_pass_through_the_target(env):
+    assert env.task.target_geom not in env.collision.pairs
+    assert env.task.target_geom not in env.starts.collision.pairs
+
+
 def test_an_episode_cannot_start_in_success():
     with pytest.raises(ValueError, match="start_distance must be above threshold"):
         mjx_arm.make(task="reach", threshold=0.1)
