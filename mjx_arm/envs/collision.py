@@ -109,6 +109,7 @@ def make_self_collision(
     mj_model: mujoco.MjModel,
     *,
     obstacles: Sequence[Obstacle] = (),
+    ignored: Sequence[int] = (),
     margin: float = MARGIN,
     home: np.ndarray | None = None,
 ) -> Collision:
@@ -123,6 +124,7 @@ def make_self_collision(
     Args:
       mj_model: an arm of planes, spheres, capsules, boxes and cylinders.
       obstacles: what else to keep away from.
+      ignored: ids of geoms that the arm may pass through, such as the mark of a place.
       margin: least clearance of a free pose, m.
       home: `[nq]`, a pose that is free by design; by default the first keyframe, or `qpos0`.
 
@@ -133,7 +135,8 @@ def make_self_collision(
       ValueError: a geom of the arm is of another type, or two geoms that are further apart in the
         chain are too near at `home`.
     """
-    arm, still = _arm_geoms(mj_model), _still_geoms(mj_model)
+    arm = _arm_geoms(mj_model)
+    still = [geom for geom in _still_geoms(mj_model) if geom not in ignored]
     for geom in (*arm, *still):
         if mj_model.geom_type[geom] not in _SOLID:
             raise ValueError(

@@ -277,8 +277,10 @@ def make_env(config: EnvConfig, *, reward: Reward | None = None, scene: Scene | 
     model, varies = scene.mj_model, task.varies
     check_varies(model, varies)
     kinematics = make_kinematics(model, varies)
-    collision = make_self_collision(model, home=arm.home_qpos)
-    around = make_self_collision(model, obstacles=task.obstacles, home=arm.home_qpos)
+    # Geoms that a task puts elsewhere in each episode are marks, not things.
+    marks = varies.get("geom_pos", ())
+    collision = make_self_collision(model, ignored=marks, home=arm.home_qpos)
+    around = make_self_collision(model, obstacles=task.obstacles, ignored=marks, home=arm.home_qpos)
     return Env(
         config=config,
         scene=scene,

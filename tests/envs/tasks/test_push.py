@@ -221,6 +221,11 @@ def test_scenes_that_do_not_fit_are_refused_by_name(tmp_path, changes, message):
         mjx_arm.make(task="push", scene=path)
 
 
+def test_the_arm_may_pass_through_the_mark(env):
+    assert env.task.mark_geom not in env.collision.pairs
+    assert env.task.mark_geom not in env.starts.collision.pairs
+
+
 def test_an_episode_cannot_start_in_success():
     with pytest.raises(ValueError, match="start_distance must be above threshold"):
         mjx_arm.make(task="push", threshold=0.2)

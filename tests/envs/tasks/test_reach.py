@@ -227,6 +227,11 @@ def test_scenes_that_do_not_fit_are_refused_by_name(tmp_path, changes, message):
         mjx_arm.make(task="reach", scene=path)
 
 
+def test_the_arm_may_pass_through_the_target(env):
+    assert env.task.target_geom not in env.collision.pairs
+    assert env.task.target_geom not in env.starts.collision.pairs
+
+
 def test_an_episode_cannot_start_in_success():
     with pytest.raises(ValueError, match="start_distance must be above threshold"):
         mjx_arm.make(task="reach", threshold=0.1)
@@ -252,7 +257,8 @@ def test_the_scene_has_the_arm_of_arm_cube_without_the_cube(capfd, tmp_path, mon
         if full.geom(a).name == "table" and not full.geom(b).name.startswith("cube")
     }
     assert {model.geom(b).name for b in model.pair_geom2} == with_table
-    # The saved text says all that the model depends on.
-    assert other.xml in scene.xml
+    # The scene keeps all texts that the model depends on.
+    (text,) = scene.files.values()
+    assert text == other.xml.encode()
     assert capfd.readouterr() == ("", "")
     assert not list(tmp_path.iterdir())
