@@ -16,7 +16,7 @@ from mjx_arm.envs.arm import Arm
 from mjx_arm.envs.env import Env
 from mjx_arm.envs.state import EnvState
 from mjx_arm.envs.tasks.lift import Lift, grasped
-from mjx_arm.kinematics import make_kinematics
+from mjx_arm.scene import Scene
 
 # Ways and distances of the plan, m.
 _HOVER = 0.09
@@ -60,7 +60,7 @@ def make_scripted_policy(env: Env) -> Callable[[EnvState], jax.Array]:
     task, arm = env.task, env.arm
     if not isinstance(task, Lift):
         raise ValueError(f"the scripted policy lifts cubes; the task is {env.config.task!r}")
-    solve = _make_inverse_kinematics(arm, _make_tool(env))
+    solve = _make_inverse_kinematics(arm, _make_tool(env.scene, arm))
     steps = np.where(
         arm.slides,
         env.config.millimetres_per_action / 1000.0,
@@ -68,8 +68,7 @@ def make_scripted_policy(env: Env) -> Callable[[EnvState], jax.Array]:
     ).astype(np.float32)
     shut = arm.ctrl_range[arm.gripper_ctrl, 0]
     top = np.float32(task.config.lift + task.half_size + _LIFT_MARGIN)
-    home = make_kinematics(env.scene.mj_model)(jnp.asarray(arm.home_qpos))
-    radius = float(jnp.hypot(*home.site_xpos[arm.grasp_site, :2]))
+    radius = float(np.hypot(*_at_home(env.scene, arm).site_xpos[arm.grasp_site, :2]))
 
     def policy(state: EnvState) -> jax.Array:
         poses, qpos = state.physics.poses, state.physics.qpos
@@ -115,19 +114,19 @@ def _raised(gripper: jax.Array, radius: float, top: np.float32) -> jax.Array:
     return jnp.append(gripper[:2] * (1 + inward / distance), height)
 
 
-def _make_tool(env: Env) -> Callable[[jax.Array], tuple[jax.Array, jax.Array]]:
+def _make_tool(scene: Scene, arm: Arm) -> Callable[[jax.Array], tuple[jax.Array, jax.Array]]:
     """Makes `tool(joints [n]) -> (pose [3, 3], slopes [3, 3, n])`.
 
     The pose has three rows: the grasp site's position (m), the direction in which the gripper
     points, and the direction from finger to finger. The slopes are its derivatives.
     """
-    model, arm = env.scene.mj_model, env.arm
+    model = scene.mj_model
     body = int(model.site_bodyid[arm.grasp_site])
     chain = [body]
     while model.body_parentid[chain[0]]:
         chain.insert(0, int(model.body_parentid[chain[0]]))
     number = {int(address): k for k, address in enumerate(arm.qpos)}
-    local = np.stack([model.site_pos[arm.grasp_site], *_directions(env, body)])
+    local = np.stack([model.site_pos[arm.grasp_site], *_directions(scene, arm, body)])
 
     def tool(joints: jax.Array) -> tuple[jax.Array, jax.Array]:
         pos, rot = jnp.zeros(3, jnp.float32), jnp.eye(3, dtype=jnp.float32)
@@ -156,21 +155,26 @@ def _make_tool(env: Env) -> Callable[[jax.Array], tuple[jax.Array, jax.Array]]:
     return tool
 
 
-def _directions(env: Env, body: int) -> tuple[np.ndarray, np.ndarray]:
+def _directions(scene: Scene, arm: Arm, body: int) -> tuple[np.ndarray, np.ndarray]:
     """Where the gripper points, and from finger to finger: unit vectors in the frame of `body`."""
-    model, arm = env.scene.mj_model, env.arm
-    data = mujoco.MjData(model)
-    data.qpos[:] = arm.home_qpos
-    mujoco.mj_kinematics(model, data)
-    across = data.xmat[body].reshape(3, 3).T @ data.xaxis[env.scene.find("joint", "left_finger")]
+    model = scene.mj_model
+    data = _at_home(scene, arm)
+    across = data.xmat[body].reshape(3, 3).T @ data.xaxis[scene.find("joint", "left_finger")]
     along = model.site_pos[arm.grasp_site] - across * (across @ model.site_pos[arm.grasp_site])
     length = np.linalg.norm(along)
     if length < 1e-3:
         raise ValueError(
-            f"scene {env.scene.name!r}: site 'grasp' must be away from the origin of its body, in "
+            f"scene {scene.name!r}: site 'grasp' must be away from the origin of its body, in "
             "the direction in which the gripper points"
         )
     return along / length, across
+
+
+def _at_home(scene: Scene, arm: Arm) -> mujoco.MjData:
+    data = mujoco.MjData(scene.mj_model)
+    data.qpos[:] = arm.home_qpos
+    mujoco.mj_kinematics(scene.mj_model, data)
+    return data
 
 
 def _slopes(pose: jax.Array, axis: jax.Array, centre: jax.Array | None) -> jax.Array:
@@ -182,13 +186,12 @@ def _slopes(pose: jax.Array, axis: jax.Array, centre: jax.Array | None) -> jax.A
 
 def _times(rot: jax.Array, other: np.ndarray | jax.Array) -> jax.Array:
     """`rot @ other` for a vector or a matrix, as sums that XLA fuses."""
-    if isinstance(other, np.ndarray):
-        if other.ndim == 2 and np.array_equal(other, np.eye(3)):
-            return rot
-        other = jnp.asarray(other, jnp.float32)
-    if other.ndim == 1:
-        return jnp.sum(rot * other, axis=-1)
-    return jnp.sum(rot[:, :, None] * other, axis=1)
+    if isinstance(other, np.ndarray) and np.array_equal(other, np.eye(3)):
+        return rot
+    right = jnp.asarray(other, jnp.float32)
+    if right.ndim == 1:
+        return jnp.sum(rot * right, axis=-1)
+    return jnp.sum(rot[:, :, None] * right, axis=1)
 
 
 def _rotation(quat: np.ndarray) -> np.ndarray:
@@ -215,7 +218,7 @@ def _make_inverse_kinematics(
     """
     home = jnp.asarray(arm.home_qpos[arm.qpos])
     low, high = arm.ctrl_range[arm.ctrl].T
-    weights = np.asarray([1.0, _DIRECTION, _DIRECTION], np.float32)[:, None]
+    weights = jnp.asarray([1.0, _DIRECTION, _DIRECTION], jnp.float32)[:, None]
     pull = np.float32(_PULL)
 
     def solve(target: jax.Array, faces: jax.Array, joints: jax.Array, held: jax.Array) -> jax.Array:
