@@ -10,8 +10,10 @@ import itertools
 import json
 import os
 import pathlib
+import re
 import signal
 import sys
+import typing
 from collections.abc import Sequence
 from types import FrameType
 from typing import Annotated, Any, NoReturn
@@ -21,7 +23,7 @@ import tyro
 from rich.console import Console
 
 from mjx_arm.config import TrainConfig, set_train_options
-from mjx_arm.options import check_name, flat_names, get_option
+from mjx_arm.options import check_name, describe, flat_names, get_option, groups
 from mjx_arm.presets import PRESETS
 from mjx_arm.report.figures import plot_curves
 from mjx_arm.report.video import check_video_path, draw_episode, record_episode, write_video
@@ -254,16 +256,39 @@ def _parse(arguments: Sequence[str]) -> Train | Eval | Play | Figures:
             )
     except SystemExit as stop:
         if stop.code == 2:
-            raise ValueError(_one_sentence(said.getvalue())) from None
+            raise ValueError(_one_sentence(said.getvalue(), arguments)) from None
         raise
     return command
 
 
-def _one_sentence(box: str) -> str:
-    """What tyro says in a box with advice below the first line across."""
+def _one_sentence(box: str, arguments: Sequence[str]) -> str:
+    """What tyro says in a box with advice below the first line across, in our words."""
     rows = [line.strip("│ ") for line in box.splitlines()]
-    message = itertools.takewhile(lambda row: not row.startswith("─"), rows[1:])
-    return f"{' '.join(message).rstrip('.')}; see --help".replace("Unrecognized", "unknown")
+    message = " ".join(itertools.takewhile(lambda row: not row.startswith("─"), rows[1:]))
+    own = re.match(r"Error parsing [^ ]*[.][^ ]*: (.*)", message)
+    if own:  # the options have refused their values themselves
+        return own[1]
+    flag = re.search(r"--[a-z][a-z-]*", message)
+    annotation = _annotation(flag[0]) if flag and flag[0] in arguments else None
+    if flag and annotation is not None and not message.startswith("Unrecognized"):
+        after = arguments[arguments.index(flag[0]) + 1 :]
+        values = list(itertools.takewhile(lambda text: not text.startswith("--"), after))
+        got = repr(" ".join(values)) if values else "nothing"
+        name = flag[0][2:].replace("-", "_")
+        return f"{name} must be {describe(annotation)}, got {got}; see --help"
+    return f"{message.rstrip('.')}; see --help".replace("Unrecognized", "unknown")
+
+
+def _annotation(flag: str) -> Any:
+    """The type of the option that a flag sets, or None."""
+    name = flag[2:].replace("-", "_")
+    classes = [type(group) for config in PRESETS.values() for group in groups(config)]
+    for cls in (*classes, Train, Eval, Play):
+        hints = typing.get_type_hints(cls, include_extras=True)
+        # The group `env` has an option `env`.
+        if name in hints and not dataclasses.is_dataclass(hints[name]):
+            return hints[name]
+    return None
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import functools
+import pathlib
 import types
 import typing
 from collections.abc import Iterable, Mapping
@@ -102,6 +103,7 @@ def describe(annotation: Any) -> str:
         return f"a tuple of {count} values, each {describe(arguments[0])}"
     words = {
         int: "a whole number",
+        pathlib.Path: "a path",
         float: "a finite number",
         bool: "true or false",
         str: "text",
@@ -178,6 +180,16 @@ def flat_names(config: Any) -> dict[str, tuple[str, ...]]:
         else:
             places[field.name] = (field.name,)
     return places
+
+
+def groups(config: Any) -> list[Any]:
+    """Nested options and all that are nested in them."""
+    found = [config]
+    for field in dataclasses.fields(config):
+        value = getattr(config, field.name)
+        if dataclasses.is_dataclass(value):
+            found += groups(value)
+    return found
 
 
 def get_option(config: Any, name: str) -> Any:
