@@ -10,13 +10,14 @@ from __future__ import annotations
 import dataclasses
 import itertools
 from collections.abc import Callable, Sequence
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from mjx_arm.digest import model_digest
 from mjx_arm.kinematics import Poses
 
 # A box or cylinder is a smaller one that is swept by a sphere of at most this radius, m: pairs of
@@ -43,6 +44,7 @@ _PLANE, _SPHERE, _CAPSULE, _BOX, _CYLINDER = (
         mujoco.mjtGeom.mjGEOM_CYLINDER,
     )
 )
+_pairs_found: dict[tuple[Any, ...], list[tuple[int, int]]] = {}
 _SOLID = (_PLANE, _SPHERE, _CAPSULE, _BOX, _CYLINDER)
 # MuJoCo shows groups 0 to 2 by default; higher ones hold guards and pads around the same links.
 _FIRST_HIDDEN_GROUP = 3
@@ -135,18 +137,8 @@ def make_self_collision(
       ValueError: a geom of the arm is of another type, or two geoms that are further apart in the
         chain are too near at `home`.
     """
+    pairs = _arm_pairs(mj_model, ignored, margin, home)
     arm = _arm_geoms(mj_model)
-    still = [geom for geom in _still_geoms(mj_model) if geom not in ignored]
-    for geom in (*arm, *still):
-        if mj_model.geom_type[geom] not in _SOLID:
-            raise ValueError(
-                f"geom {mj_model.geom(geom).name!r} is a "
-                f"{mujoco.mjtGeom(mj_model.geom_type[geom]).name}; clearance is known of planes, "
-                "spheres, capsules, boxes and cylinders"
-            )
-    pairs = [(a, b) for a, b in itertools.combinations(arm, 2) if not _joined(mj_model, a, b)]
-    pairs += [(a, b) for a in still for b in arm if not _joined(mj_model, a, b)]
-    pairs = _reachable(mj_model, _apart_at_home(mj_model, pairs, home, margin), margin)
     pairs.sort(key=lambda pair: mj_model.geom_type[pair[0]] != _PLANE)
     cores = [[_core(mj_model, geom) for geom in pair] for pair in pairs]
     for obstacle, geom in itertools.product(obstacles, arm):
@@ -158,6 +150,37 @@ def make_self_collision(
     used = np.unique(ids)
     of_all, of_used = (_make_clearances(ids, sizes, planes, take) for take in (used, None))
     return Collision(ids, margin, of_all, used, of_used)
+
+
+def _arm_pairs(
+    mj_model: mujoco.MjModel, ignored: Sequence[int], margin: float, home: np.ndarray | None
+) -> list[tuple[int, int]]:
+    """Pairs of the arm's geoms with each other and with still ones; see `make_self_collision`.
+
+    They are kept by the contents of the model, because thousands of poses are tried to find them.
+    """
+    at = None if home is None else np.asarray(home).tobytes()
+    key = (model_digest(mj_model), tuple(ignored), margin, at)
+    if key not in _pairs_found:
+        _pairs_found[key] = _find_pairs(mj_model, ignored, margin, home)
+    return list(_pairs_found[key])
+
+
+def _find_pairs(
+    mj_model: mujoco.MjModel, ignored: Sequence[int], margin: float, home: np.ndarray | None
+) -> list[tuple[int, int]]:
+    arm = _arm_geoms(mj_model)
+    still = [geom for geom in _still_geoms(mj_model) if geom not in ignored]
+    for geom in (*arm, *still):
+        if mj_model.geom_type[geom] not in _SOLID:
+            raise ValueError(
+                f"geom {mj_model.geom(geom).name!r} is a "
+                f"{mujoco.mjtGeom(mj_model.geom_type[geom]).name}; clearance is known of planes, "
+                "spheres, capsules, boxes and cylinders"
+            )
+    pairs = [(a, b) for a, b in itertools.combinations(arm, 2) if not _joined(mj_model, a, b)]
+    pairs += [(a, b) for a in still for b in arm if not _joined(mj_model, a, b)]
+    return _reachable(mj_model, _apart_at_home(mj_model, pairs, home, margin), margin)
 
 
 def _make_clearances(

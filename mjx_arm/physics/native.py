@@ -23,6 +23,7 @@ import numpy as np
 from mujoco import batch as mj_batch
 
 from mjx_arm.cores import usable_cores
+from mjx_arm.digest import model_digest
 from mjx_arm.kinematics import Poses, make_kinematics
 from mjx_arm.physics import host_call
 from mjx_arm.physics.base import (
@@ -295,11 +296,8 @@ def _num_threads(simulations: int) -> int:
 
 def _name_of(mj_model: mujoco.MjModel, substeps: int, varies: Varies) -> str:
     """The name of this model's steps in compiled programs, the same in every process."""
-    buffer = np.empty(mujoco.mj_sizeModel(mj_model), np.uint8)
-    mujoco.mj_saveModel(mj_model, None, buffer)
-    digest = hashlib.sha256(buffer.tobytes())
-    if varies:
-        digest.update(repr(sorted(varies.items())).encode())
+    digest = hashlib.sha256(model_digest(mj_model).encode())
+    digest.update(repr(sorted(varies.items())).encode())
     return f"mjx_arm_step_{substeps}_{digest.hexdigest()[:32]}"
 
 
