@@ -55,7 +55,8 @@ def _find(option: str, known: Mapping[str, Any]) -> tuple[str, bool]:
     off = name.removeprefix("no_")
     if name not in known and known.get(off) is bool:
         return off, False
-    check_name("option", f"--{name.replace('_', '-')}", [f"--{x.replace('_', '-')}" for x in known])
+    flags = [x.replace("_", "-") for x in known]
+    check_name("option", name.replace("_", "-"), flags, prefix="--")
     return name, True
 
 

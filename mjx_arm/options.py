@@ -37,6 +37,8 @@ Discount = Annotated[float, Field(gt=0, le=1)]
 Size = tuple[Count, Count]
 
 _STRICT = pydantic.ConfigDict(strict=True, extra="forbid", allow_inf_nan=False)
+# More names than this are not listed in an error.
+_MOST_LISTED = 30
 _NUMBER_WORDS = ("no", "one", "two", "three", "four", "five", "six")
 
 
@@ -172,8 +174,14 @@ def _fields_of(cls: Any) -> dict[str, Any]:
     return _annotations(cls)
 
 
-def check_name(what: str, name: str, known: Iterable[str]) -> None:
+def check_name(what: str, name: str, known: Iterable[str], *, prefix: str = "") -> None:
     """Refuses an unknown name, and offers the nearest known one.
+
+    Args:
+      what: what the name is of.
+      name: the name.
+      known: all names.
+      prefix: what stands before each name where a user types it.
 
     Raises:
       ValueError: `name` is not in `known`.
@@ -182,8 +190,13 @@ def check_name(what: str, name: str, known: Iterable[str]) -> None:
     if name in names:
         return
     near = difflib.get_close_matches(str(name), names, n=1, cutoff=0.6)
-    offer = f"did you mean {near[0]!r}?" if near else f"known are {', '.join(names)}"
-    raise ValueError(f"unknown {what} {name!r}: {offer}")
+    if near:
+        offer = f"did you mean {prefix + near[0]!r}?"
+    elif len(names) > _MOST_LISTED:
+        offer = "see --help"
+    else:
+        offer = f"known are {', '.join(prefix + known for known in names)}"
+    raise ValueError(f"unknown {what} {prefix + name!r}: {offer}")
 
 
 def flat_names(config: Any) -> dict[str, tuple[str, ...]]:

@@ -25,6 +25,7 @@ from mjx_arm.config import (
 from mjx_arm.options import flat_names
 from mjx_arm.presets import PRESETS
 from mjx_arm.report.metrics import read_metrics
+from mjx_arm.scene import SceneSource, load_scene
 from mjx_arm.training.agent import load_agent, read_agent, save_agent
 from mjx_arm.training.run_folder import SavedRun, load_config, new_run_folder, save_run
 
@@ -155,12 +156,12 @@ def test_the_agent_acts(run_folder):
         (["--preset"], "preset must be text, got nothing"),
         (["--size", "4"], "size must be a tuple of two values, each a whole number of at least 1"),
         (["--camera"], "camera must name at least one camera, got ()"),
-        (["--colour", "red"], "unknown options: --colour, red"),
-        (["--num-envs", "many"], "num_envs must be a whole number of at least 1, got 'many'"),
+        (["--colour", "red"], "unknown option '--colour'"),
+        (["--num-envs", "many"], "--num-envs must be a whole number of at least 1, got 'many'"),
         (["--num-seeds", "0"], "num_seeds must be a whole number of at least 1, got 0"),
         (["--select-every", "-1"], "select_every must be a whole number of at least 0, got -1"),
-        (["--eval-episodes", "0"], "eval_episodes must be at least 1, got 0"),
-        (["--stop-at", "1.5"], "stop_at must be above 0 and at most 1, got 1.5"),
+        (["--eval-episodes", "0"], "eval_episodes must be a whole number of at least 1, got 0"),
+        (["--stop-at", "1.5"], "stop_at must be a finite number above 0 and of at most 1"),
         (["--seed", "-1"], "seed must be a whole number of at least 0, got -1"),
         (["--max-steps", "3000000000"], "max_steps must be a whole number of at least 1 and at mo"),
         (["--epsilon-steps", "3000000000"], "at most 2147483647, got 3000000000"),
@@ -273,7 +274,7 @@ def test_a_video_that_could_not_be_written_is_refused_first(
 
 
 def test_figures_of_a_run_without_metrics_are_refused(tmp_path, capsys):
-    save_run(tmp_path, SavedRun(TrainConfig(), {}, ""))
+    save_run(tmp_path, SavedRun(TrainConfig(), {}, load_scene("arm_cube").source))
     # A process that was killed has left half a line.
     (tmp_path / "metrics.jsonl").write_text('{"env_steps": 20')
     assert main(["figures", str(tmp_path)]) == 2
@@ -291,8 +292,8 @@ def test_figures_draws_the_curves_again(run_folder, capsys):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--epsilon", "10"], "epsilon must be from 0 to 1, got 10.0"),
-        (["--epsilon", "nan"], "epsilon must be from 0 to 1, got nan"),
+        (["--epsilon", "10"], "epsilon must be a finite number from 0 to 1, got 10.0"),
+        (["--epsilon", "nan"], "epsilon must be a finite number, got nan"),
         (
             ["--seed", "100000000000000000000"],
             "seed must be from 0 to 2147483647, got 100000000000000000000",
@@ -343,7 +344,7 @@ def test_a_file_that_is_not_an_agent_is_refused(command, damage, run_folder, tmp
             path,
             set_train_options(config, {"hidden": 32}),
             flax.traverse_util.unflatten_dict(tensors, sep="/"),
-            scene=metadata["scene"],
+            scene=SceneSource.from_json(json.loads(metadata["scene"]), "test"),
             objects={},
             env_steps=0,
         )
