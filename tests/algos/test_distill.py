@@ -333,9 +333,11 @@ def test_seeds_side_by_side_are_the_runs_one_by_one(run):
         np.testing.assert_array_equal(
             both.replay.steps.action[seed], alone[seed].replay.steps.action
         )
-        pairs = map(jax.tree.leaves, (both.learner, alone[seed].learner))
-        for a, b in zip(*pairs, strict=True):
-            np.testing.assert_allclose(a[seed], b, atol=1e-4)
+        # Adam turns a rounding of a gradient near zero into a step: compare with the other seed.
+        triples = map(jax.tree.leaves, (both.learner, alone[seed].learner, alone[1 - seed].learner))
+        for a, b, other in zip(*triples, strict=True):
+            apart = np.linalg.norm(np.subtract(b, other, dtype=float))
+            assert np.linalg.norm(np.subtract(a[seed], b, dtype=float)) <= 0.02 * apart + 1e-4
 
 
 @pytest.mark.slow
