@@ -30,9 +30,10 @@ from mjx_arm.training.objects import Objects, Record, check_record
 
 _FORMAT = "mjx_arm agent 2"
 LAST, BEST = "last.safetensors", "best.safetensors"
-# What an agent sees; all other options of the environment are fixed by its name.
+_AGENTS = pathlib.Path(__file__).parents[1] / "agents"
 # Means the scene in an agent's file where a scene's name is asked for.
 STORED = "stored"
+# What an agent sees; all other options of the environment are fixed by its name.
 _SIGHT = ("scene", "task", "observation", "size", "camera", "shadows")
 
 
@@ -341,11 +342,14 @@ def differences(trained: EnvConfig, judged: EnvConfig) -> dict[str, tuple[Any, A
 
 
 def find_agent(path: pathlib.Path) -> pathlib.Path:
-    """The agent's file that a path means.
+    """The agent's file that a path means, or the name of an agent that comes with the package.
 
     Raises:
       ValueError: there is none.
     """
+    shipped = _AGENTS / f"{path}.safetensors"
+    if not path.exists() and str(path) in shipped_agents():
+        return shipped
     if path.is_file():
         return path
     for name in (BEST, LAST):
@@ -355,7 +359,15 @@ def find_agent(path: pathlib.Path) -> pathlib.Path:
         seeds = ", ".join(sorted(str(seed) for seed in path.glob("seed-*")))
         hint = f"give one of {seeds}" if seeds else "the run has not saved one yet"
         raise ValueError(f"{path} holds no agent: {hint}")
-    raise ValueError(f"{path} is not a run folder and not an agent: give one that `train` has made")
+    raise ValueError(
+        f"{path} is not a run folder and not an agent: give one that `train` has made, or one of "
+        f"{', '.join(shipped_agents())}"
+    )
+
+
+def shipped_agents() -> list[str]:
+    """Names of the agents that come with the package; beside each file is its card."""
+    return sorted(path.stem for path in _AGENTS.glob("*.safetensors"))
 
 
 def read_selection_rate(path: pathlib.Path) -> float | None:

@@ -20,6 +20,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 
 from mjx_arm.training.memory import tree_size
 from mjx_arm.training.seal import is_sealed, seal
@@ -318,8 +319,8 @@ def _is_key(leaf: Any) -> bool:
     return bool(jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key))
 
 
-def _to_data(tree: Any) -> Any:
-    """PRNG keys, which orbax does not know, as the arrays behind them."""
+def _to_data(tree: Any) -> dict[str, Any]:
+    """The arrays that orbax can write: no empty ones, and PRNG keys as the arrays behind them."""
 
     def convert(leaf: Any) -> Any:
         if not _is_key(leaf):
@@ -328,16 +329,24 @@ def _to_data(tree: Any) -> Any:
             return jax.eval_shape(jax.random.key_data, leaf)
         return jax.random.key_data(leaf)
 
-    return jax.tree.map(convert, tree)
+    leaves = enumerate(jax.tree.leaves(tree))
+    return {f"{i:05d}": convert(leaf) for i, leaf in leaves if leaf.size}
 
 
-def _here(tree: Any) -> Any:
+def _here(data: dict[str, Any]) -> dict[str, Any]:
     """Shapes and dtypes on this machine's device; the checkpoint's own may not be here."""
     device = jax.sharding.SingleDeviceSharding(jax.devices()[0])
-    return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=device), tree)
+    return {
+        name: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=device) for name, x in data.items()
+    }
 
 
-def _from_data(data: Any, like: Any) -> Any:
-    return jax.tree.map(
-        lambda x, wanted: jax.random.wrap_key_data(x) if _is_key(wanted) else x, data, like
-    )
+def _from_data(data: dict[str, Any], like: Any) -> Any:
+    def convert(i: int, wanted: Any) -> Any:
+        if not wanted.size:
+            return jnp.zeros(wanted.shape, wanted.dtype)
+        x = data[f"{i:05d}"]
+        return jax.random.wrap_key_data(x) if _is_key(wanted) else x
+
+    leaves, structure = jax.tree.flatten(like)
+    return jax.tree.unflatten(structure, [convert(i, x) for i, x in enumerate(leaves)])
