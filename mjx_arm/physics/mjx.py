@@ -41,6 +41,7 @@ _MAX_VALUE = 1e10
 # Enough for the 17 contacts that the scene's pairs allow in 16,384 environments: 80 MB. MJX drops
 # contacts beyond this number.
 _WARP_CONTACTS = 17 * 16_384
+_MJX_NUMERICS = ("max_contact_points", "max_geom_pairs")
 
 # Fields that change the physics of MuJoCo C where they are not zero, and that MJX does not read.
 _IGNORED_FIELDS = (
@@ -125,6 +126,18 @@ def _put(mj_model: mujoco.MjModel, impl: str) -> tuple[Any, Any]:
         raise ValueError(_not_implemented(_plain(str(error)))) from error
 
 
+def _place_numerics(told: mujoco.MjModel) -> None:
+    """Puts the numerics that MJX reads to where it looks for them.
+
+    MJX 3.17 takes `numeric_data[id]`, which is another numeric's number wherever one before it has
+    several (`_numeric` in its collision_driver.py).
+    """
+    names = [told.numeric(i).name for i in range(told.nnumeric)]
+    found = [names.index(name) for name in _MJX_NUMERICS if name in names]
+    values = [told.numeric_data[told.numeric_adr[i]] for i in found]
+    told.numeric_data[found] = values
+
+
 def make_mjx(
     mj_model: mujoco.MjModel, substeps: int, varies: Varies = NO_VARIES, impl: str = "jax"
 ) -> Physics:
@@ -155,6 +168,7 @@ def make_mjx(
     # MJX never resets by itself, and its "warp" does not accept the flag that says so.
     told = copy.copy(mj_model)
     told.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
+    _place_numerics(told)
     model, template = _put(told, impl)
     nv = mj_model.nv
 

@@ -131,9 +131,15 @@ def scripted_rollout(scene: str, num_envs: int, length: int, *, collision: bool)
     """
     env = mjx_arm.make("B", scene=scene, physics="native", observation="state", placement="always")
     if not collision:
-        free = Collision(np.zeros((0, 2), int), 0.0, lambda poses: jnp.full((1,), jnp.inf))
+
+        def apart(poses):
+            return jnp.full((1,), jnp.inf)
+
+        none = np.zeros(0, int)
+        free = Collision(none.reshape(0, 2), 0.0, apart, none, apart)
+        links = make_kinematics(env.scene.mj_model, geoms=())
         starts = dataclasses.replace(env.starts, collision=free)
-        env = dataclasses.replace(env, collision=free, starts=starts)
+        env = dataclasses.replace(env, collision=free, link_kinematics=links, starts=starts)
     policy = make_scripted_policy(env)
 
     def step(state, _):

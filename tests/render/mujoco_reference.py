@@ -154,4 +154,4 @@ def wrist_scene() -> Scene:
     spec.body("gripper").add_camera(
         name="wrist", pos=[0.03, 0.01, 0.06], quat=[0.55, 0.38, -0.47, -0.58], fovy=70
     )
-    return Scene(name="wrist", mj_model=spec.compile())
+    return Scene(name="wrist", mj_model=spec.compile(), xml=spec.to_xml())

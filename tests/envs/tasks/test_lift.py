@@ -21,7 +21,10 @@ LIFT = 0.3
 TOUCH_FORCE = 0.1
 LEAST_PRECISION = 0.98
 LEAST_RECALL = 0.98
-REWARDS = {"paper": paper_reward, "completion": completion_reward}
+REWARDS = {
+    "paper": lambda config, *step: paper_reward(config, 0.0, *step),
+    "completion": completion_reward,
+}
 SCENE = pathlib.Path(__file__).parents[3] / "xml" / "arm_cube.xml"
 
 
@@ -56,6 +59,12 @@ def total(kind: str, config: LiftConfig | None = None, **situation) -> float:
 )
 def test_paper_is_algorithm_1(situation, expected):
     assert total("paper", **situation) == pytest.approx(expected, rel=1e-6)
+
+
+def test_the_papers_height_is_that_of_the_cubes_centre():
+    after = snapshot(grasped=True, height=0.2)
+    terms = paper_reward(LiftConfig(), 0.025, snapshot(), after, jnp.int32(0))
+    assert float(terms["lift"]) == pytest.approx(0.225, rel=1e-6)
 
 
 def test_units_of_the_paper_are_options():
