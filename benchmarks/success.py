@@ -4,7 +4,7 @@ For each run folder: how long it trained, 1,000 episodes of the best agent on th
 epsilon 0.1 with a seed that neither training nor selection has seen, 100 episodes under MJX, and
 Newcombe's 95 % interval of the difference.
 
-    python benchmarks/success.py runs/NAME [runs/NAME ...] --json benchmarks/results/success_A.json
+    python benchmarks/success.py runs/NAME [runs/NAME ...] --json benchmarks/results/success.json
 
 Rows that the file has of other environments and seeds stay, each with the machine it is from.
 """
