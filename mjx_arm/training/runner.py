@@ -331,7 +331,7 @@ def _prepare(
         console.print(f"[yellow]warning: {sentence}[/yellow]", soft_wrap=True)
     parts = objects.given()
     if scene is not None and objects.env is None:
-        parts["env"] = make_env(config.env, reward=objects.reward, scene=scene)
+        parts["env"] = make_env(config.env, reward=parts.pop("reward", None), scene=scene)
     trainer = make_trainer(config, **parts)
     plan = memory_plan(_shapes(trainer))
     say_memory(console, plan)
