@@ -273,7 +273,9 @@ def test_stop_at_ends_the_run_when_a_selection_reaches_it(tmp_path, monkeypatch)
 
 @pytest.mark.parametrize("stop_at", [0.0, 1.5, float("nan")])
 def test_a_stop_that_is_no_share_is_refused(stop_at, tmp_path):
-    with pytest.raises(ValueError, match="stop_at must be above 0 and at most 1, got"):
+    with pytest.raises(
+        ValueError, match="stop_at must be a finite number above 0 and of at most 1 or None, got"
+    ):
         train(tmp_path / "run", stop_at=stop_at)
 
 
