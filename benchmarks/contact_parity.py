@@ -125,7 +125,7 @@ def after_native(model: mujoco.MjModel, states: dict[str, np.ndarray]) -> np.nda
 
 
 def mjx_step(model: mujoco.MjModel, iterations: int, line_search: int) -> Any:
-    """MJX's physics with so many solver and line search iterations, and its jit options."""
+    """MJX's physics with these numbers of solver and line search iterations, and its jit options."""
     counts = iterations, line_search
     physics = make_physics(model, "mjx", substeps=SUBSTEPS, mjx_iterations=counts)
     return physics, compiler_options(physics)
@@ -233,7 +233,7 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--iterations", nargs="*", type=int, default=[5, 6, 7, 8, 10])
     parser.add_argument("--line-search", nargs="+", type=int, default=[8])
     parser.add_argument("--tolerance", type=float, default=5e-3, help="of qpos, m and rad")
-    parser.add_argument("--states", type=int, default=915, help="at most so many")
+    parser.add_argument("--states", type=int, default=915, help="maximum number of states")
     parser.add_argument("--num-envs", type=int, default=64, help="in the rollouts")
     parser.add_argument("--repeats", type=int, default=5, help="of a timed step")
     parser.add_argument("--rounds", type=int, default=5, help="alternating rounds of two scenes")

@@ -277,7 +277,7 @@ def make_env(config: EnvConfig, *, reward: Reward | None = None, scene: Scene | 
     model, varies = scene.mj_model, task.varies
     check_varies(model, varies)
     kinematics = make_kinematics(model, varies)
-    # Geoms that a task puts elsewhere in each episode are marks, not things.
+    # Geoms whose place varies by episode mark a place; the arm may pass through them.
     marks = varies.get("geom_pos", ())
     collision = make_self_collision(model, ignored=marks, home=arm.home_qpos)
     around = make_self_collision(model, obstacles=task.obstacles, ignored=marks, home=arm.home_qpos)
