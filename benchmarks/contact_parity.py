@@ -125,7 +125,7 @@ def after_native(model: mujoco.MjModel, states: dict[str, np.ndarray]) -> np.nda
 
 
 def mjx_step(model: mujoco.MjModel, iterations: int, line_search: int) -> Any:
-    """MJX's physics with these numbers of solver and line search iterations, and its jit options."""
+    """MJX's physics with given solver and line search iterations, and its jit options."""
     counts = iterations, line_search
     physics = make_physics(model, "mjx", substeps=SUBSTEPS, mjx_iterations=counts)
     return physics, compiler_options(physics)
