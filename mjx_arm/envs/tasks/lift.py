@@ -40,6 +40,8 @@ class LiftConfig(TaskConfig):
     Attributes:
       lift: height that the cube must be lifted to, above its rest, m.
       start: `home`, or `in_grasp` with the cube in the closed gripper.
+      rectangle_scale: factor on the edges of the rectangle in which the cube's places are sampled.
+        An agent that trains with more than 1 has seen the places to which a cube is knocked.
       success_reward: paid once, on success.
       distance_decay: per `distance_unit`, reward `paper`; its 0.25.
       distance_unit: m; the paper names none, ours is a decimetre.
@@ -53,6 +55,7 @@ class LiftConfig(TaskConfig):
 
     lift: Positive = 0.3
     start: Literal["home", "in_grasp"] = "home"
+    rectangle_scale: Positive = 1.0
     success_reward: float = 100.0
     distance_decay: Positive = 0.25
     distance_unit: Positive = 0.1
@@ -85,7 +88,8 @@ class Lift:
         self.cube_qpos = int(model.jnt_qposadr[scene.find("joint", _CUBE)])
         self.pad_geoms = _find_pads(scene)
         self.half_size = _check_cube(scene, self.cube_geom, arm)
-        self._centre, self._extent = rectangle(scene, "cube_rectangle")
+        self._centre, extent = rectangle(scene, "cube_rectangle")
+        self._extent = extent * np.float32(config.rectangle_scale)
         self._home = arm.home_qpos[self.cube_qpos : self.cube_qpos + 2]
         self._kinematics = make_kinematics(model)
         self.varies: Varies = {}
