@@ -28,7 +28,10 @@ from mjx_arm.options import check_name, flat_annotations, flat_names, get_option
 from mjx_arm.presets import PRESETS
 from mjx_arm.report.figures import plot_curves
 from mjx_arm.report.progress import make_console
+from mjx_arm.report.run_page import write_report
 from mjx_arm.report.video import check_video_path, draw_episode, record_episode, write_video
+from mjx_arm.tools.compare import describe, read_result, to_json, write_comparison
+from mjx_arm.tools.zoo import describe_zoo, read_shipped, read_zoo
 from mjx_arm.training.agent import Agent, differences, load_agent
 from mjx_arm.training.evaluate import evaluate
 from mjx_arm.training.loop import EVALUATION, role_key
@@ -200,7 +203,7 @@ class Play(_Try):
 
 @dataclasses.dataclass(frozen=True)
 class Figures:
-    """Draw the curves of a run again.
+    """Draw the curves of a run again, and write its report, also while it trains.
 
     Attributes:
       folder: a run folder.
@@ -212,18 +215,77 @@ class Figures:
         """Runs the command."""
         del given
         config = load_config(self.folder)
-        for path in plot_curves(seed_folders(self.folder, config), into=self.folder):
+        seeds = seed_folders(self.folder, config)
+        for path in plot_curves(seeds, into=self.folder):
             print(path)
+        print(write_report(self.folder, config, seeds))
 
 
-Command = Train | Eval | Play | Figures
+@dataclasses.dataclass(frozen=True)
+class Compare:
+    """Put runs side by side: success with 95 % intervals, time to a success rate, options.
+
+    Attributes:
+      runs: run folders; the others are compared with the first.
+      out: a page to write, ending in `.html`, with the curves of all runs in one picture.
+      json: print one JSON array.
+    """
+
+    runs: tyro.conf.Positional[tuple[pathlib.Path, ...]]
+    out: pathlib.Path | None = None
+    json: bool = False
+
+    def run(self, given: frozenset[str]) -> None:
+        """Runs the command."""
+        del given
+        results = [read_result(folder) for folder in self.runs]
+        print(json.dumps(to_json(results)) if self.json else describe(results))
+        if self.out is not None:
+            write_comparison(results, self.out)
+            print(self.out, file=sys.stderr if self.json else sys.stdout)
+
+
+@dataclasses.dataclass(frozen=True)
+class Agents:
+    """List the agents that come with the package, or show the card of one.
+
+    Attributes:
+      agent: name of an agent whose card to show.
+      json: print JSON: an array of all agents, or one object.
+    """
+
+    agent: tyro.conf.Positional[str | None] = None
+    json: bool = False
+
+    def run(self, given: frozenset[str]) -> None:
+        """Runs the command."""
+        del given
+        if self.agent is not None:
+            agent = read_shipped(self.agent)
+            print(json.dumps(agent.to_json()) if self.json else agent.card.rstrip())
+            return
+        agents = read_zoo()
+        if self.json:
+            print(json.dumps([agent.to_json() for agent in agents]))
+            return
+        print(describe_zoo(agents))
+        print("\nmjx-arm agents NAME shows its card; mjx-arm play NAME records a video.")
+
+
+Command = Train | Eval | Play | Figures | Compare | Agents
 _COMMANDS: dict[str, type[Command]] = {
     "train": Train,
     "eval": Eval,
     "play": Play,
     "figures": Figures,
+    "compare": Compare,
+    "agents": Agents,
 }
-_SUBJECTS = {"agent": "an agent's file or a run folder", "folder": "a run folder"}
+_SUBJECTS = {
+    "agent": "an agent's file or a run folder",
+    "folder": "a run folder",
+    "runs": "run folders",
+}
 
 
 def default_preset() -> str:
@@ -267,10 +329,19 @@ def _parse(arguments: Sequence[str]) -> tuple[Command, frozenset[str]]:
     known = _annotations(kind)
     subject = next(iter(known))
     values, others = read_arguments(arguments[1:], known | {subject: pathlib.Path})
-    if not others:
-        raise ValueError(f"{arguments[0]} needs {subject.upper()}, {_SUBJECTS[subject]}")
-    _check_none(others[1:])
-    return kind(**{**values, subject: pathlib.Path(others[0])}), frozenset(values)
+    return kind(**{**values, **_subject(kind, subject, arguments[0], others)}), frozenset(values)
+
+
+def _subject(kind: type[Command], name: str, command: str, given: Sequence[str]) -> dict[str, Any]:
+    """The argument of a command that has no `--`, by its name; empty where it may be left out."""
+    if not given and kind is not Agents:
+        raise ValueError(f"{command} needs {name.upper()}, {_SUBJECTS[name]}")
+    if kind is Compare:
+        return {name: tuple(pathlib.Path(text) for text in given)}
+    _check_none(given[1:])
+    if not given:
+        return {}
+    return {name: given[0] if kind is Agents else pathlib.Path(given[0])}
 
 
 def _parse_train(arguments: Sequence[str]) -> tuple[Train, frozenset[str]]:
@@ -299,7 +370,7 @@ def _check_none(others: Sequence[str]) -> None:
 def _help(arguments: Sequence[str]) -> NoReturn:
     """Prints the help, which shows the values of the preset, and the options of the task."""
     with_preset = Annotated[Train, tyro.conf.subcommand("train", default=_start(arguments))]
-    commands: Any = with_preset | Eval | Play | Figures
+    commands: Any = with_preset | Eval | Play | Figures | Compare | Agents
     first = [name for name in arguments[:1] if name in _COMMANDS]
     tyro.cli(
         commands,
