@@ -37,6 +37,7 @@ from mjx_arm.training.evaluate import evaluate
 from mjx_arm.training.loop import EVALUATION, role_key
 from mjx_arm.training.run_folder import load_config, parse_run, read_text, seed_folders
 from mjx_arm.training.runner import RunInterruptedError, resume, stop_signals, train
+from mjx_arm.view.viewer import ViewOptions, view
 
 # Options that may change when a run is resumed.
 _CHANGEABLE = frozenset({"resume", "total_steps", "eval_episodes", "stop_at"})
@@ -272,7 +273,43 @@ class Agents:
         print("\nmjx-arm agents NAME shows its card; mjx-arm play NAME records a video.")
 
 
-Command = Train | Eval | Play | Figures | Compare | Agents
+@dataclasses.dataclass(frozen=True)
+class View:
+    """Watch an agent in the browser: its Q-values, what it sees; step, push the cube by hand.
+
+    An agent of a run that still trains is loaded again as often as the run saves it.
+
+    Attributes:
+      subject: an agent, a run folder, or the name or path of a scene.
+      env: environment, `A` or `B`; by default the agent's own, and `A` for a scene.
+      task: of a scene; by default the one that the scene was made for.
+      physics: backend; by default native on a CPU and mjx on other devices.
+      seed: of the first episode.
+      epsilon: share of random actions.
+      max_steps: iterations until an episode is truncated.
+      host: address to listen on. Whoever reaches an address other than 127.0.0.1 can work the
+        viewer.
+      port: to listen on.
+    """
+
+    subject: tyro.conf.Positional[pathlib.Path]
+    env: str | None = None
+    task: str | None = None
+    physics: str | None = None
+    seed: int = 0
+    epsilon: float = 0.1
+    max_steps: int = 1_000
+    host: str = "127.0.0.1"
+    port: int = 8080
+
+    def run(self, given: frozenset[str]) -> None:
+        """Runs the command."""
+        del given
+        check_device()
+        view(ViewOptions(**dataclasses.asdict(self)))
+
+
+Command = Train | Eval | Play | Figures | Compare | Agents | View
 _COMMANDS: dict[str, type[Command]] = {
     "train": Train,
     "eval": Eval,
@@ -280,11 +317,13 @@ _COMMANDS: dict[str, type[Command]] = {
     "figures": Figures,
     "compare": Compare,
     "agents": Agents,
+    "view": View,
 }
 _SUBJECTS = {
     "agent": "an agent's file or a run folder",
     "folder": "a run folder",
     "runs": "run folders",
+    "subject": "an agent, a run folder or a scene",
 }
 
 
@@ -370,7 +409,7 @@ def _check_none(others: Sequence[str]) -> None:
 def _help(arguments: Sequence[str]) -> NoReturn:
     """Prints the help, which shows the values of the preset, and the options of the task."""
     with_preset = Annotated[Train, tyro.conf.subcommand("train", default=_start(arguments))]
-    commands: Any = with_preset | Eval | Play | Figures | Compare | Agents
+    commands: Any = with_preset | Eval | Play | Figures | Compare | Agents | View
     first = [name for name in arguments[:1] if name in _COMMANDS]
     tyro.cli(
         commands,

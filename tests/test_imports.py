@@ -33,10 +33,11 @@ FORBIDDEN = {
     "report": ("presets", "networks", "training", "interop", "cli"),
     "interop": ("config", "presets", "networks", "algos", "training", "report", "cli"),
     "training": ("interop", "cli", "presets"),
-    "tools": ("interop", "cli", "presets"),
+    "tools": ("interop", "cli", "presets", "view"),
+    "view": ("interop", "cli", "presets", "tools"),
 }
 # Only the command line imports these.
-OUTERMOST = ("tools",)
+OUTERMOST = ("tools", "view")
 
 
 def modules(part: str) -> list[pathlib.Path]:

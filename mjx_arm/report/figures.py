@@ -7,6 +7,7 @@ import io
 import itertools
 import pathlib
 from collections.abc import Mapping, Sequence
+from typing import Literal
 
 import matplotlib
 import numpy as np
@@ -263,7 +264,7 @@ def _finish(axes: Axes, panel: _Panel, x_name: str, *, legend: bool) -> None:
         axes.legend(fontsize=7, loc=_emptier_corner(axes))
 
 
-def _emptier_corner(axes: Axes) -> str:
+def _emptier_corner(axes: Axes) -> Literal["upper right", "lower right"]:
     """The corner that a curve leaves free: matplotlib's own search warns on a busy machine."""
     heights = [y for line in axes.get_lines() for y in np.asarray(line.get_ydata(), float)[-1:]]
     low, high = axes.get_ylim()
