@@ -14,7 +14,7 @@ import sys
 import typing
 from collections.abc import Sequence
 from types import FrameType
-from typing import Annotated, Any, NoReturn
+from typing import Annotated, Any, NoReturn, TypeVar
 
 import jax
 import tyro
@@ -31,16 +31,25 @@ from mjx_arm.report.progress import make_console
 from mjx_arm.report.run_page import write_report
 from mjx_arm.report.video import check_video_path, draw_episode, record_episode, write_video
 from mjx_arm.tools.compare import describe, read_result, to_json, write_comparison
+from mjx_arm.tools.search_space import parse_space
+from mjx_arm.tools.sweep import describe_sweep, sweep
+from mjx_arm.tools.wandb_log import WandbLog, import_wandb
 from mjx_arm.tools.zoo import describe_zoo, read_shipped, read_zoo
 from mjx_arm.training.agent import Agent, differences, load_agent
 from mjx_arm.training.evaluate import evaluate
 from mjx_arm.training.loop import EVALUATION, role_key
-from mjx_arm.training.run_folder import load_config, parse_run, read_text, seed_folders
+from mjx_arm.training.run_folder import (
+    load_config,
+    new_run_folder,
+    parse_run,
+    read_text,
+    seed_folders,
+)
 from mjx_arm.training.runner import RunInterruptedError, resume, stop_signals, train
 from mjx_arm.view.viewer import ViewOptions, view
 
 # Options that may change when a run is resumed.
-_CHANGEABLE = frozenset({"resume", "total_steps", "eval_episodes", "stop_at"})
+_CHANGEABLE = frozenset({"resume", "total_steps", "eval_episodes", "stop_at", "wandb"})
 
 
 @dataclasses.dataclass(frozen=True)
@@ -63,6 +72,7 @@ class Train:
       stop_at: end the run when an evaluation that selects has reached this success rate.
       eval_episodes: episodes of the evaluation at the end, by the best agent, at epsilon 0.1 and on
         starts and random numbers that neither training nor the selection has seen.
+      wandb: also log the run to Weights & Biases; `WANDB_MODE=offline` keeps it in the run folder.
     """
 
     options: Annotated[TrainConfig, tyro.conf.arg(name="")]
@@ -73,6 +83,7 @@ class Train:
     init_from: pathlib.Path | None = None
     stop_at: float | None = None
     eval_episodes: int = 200
+    wandb: bool = False
 
     def run(self, given: frozenset[str]) -> None:
         """Runs the command; `given` are the names of the options on the command line."""
@@ -82,14 +93,27 @@ class Train:
             return
         if self.config is None:
             console.print(f"preset: {self.preset}")
-        train(
-            self.options,
-            self.out,
-            eval_episodes=self.eval_episodes,
-            stop_at=self.stop_at,
-            init_from=self.init_from,
-            console=console,
-        )
+        out = self.out
+        if self.wandb and out is None:
+            import_wandb()
+            out = new_run_folder(self.options.env.env)
+        with self._log(out) as on_chunk:
+            train(
+                self.options,
+                out,
+                eval_episodes=self.eval_episodes,
+                stop_at=self.stop_at,
+                init_from=self.init_from,
+                on_chunk=on_chunk,
+                console=console,
+            )
+
+    def _log(
+        self, folder: pathlib.Path | None
+    ) -> contextlib.AbstractContextManager[WandbLog | None]:
+        if not self.wandb or folder is None:
+            return contextlib.nullcontext()
+        return WandbLog(folder)
 
     def _resume(self, folder: pathlib.Path, given: frozenset[str], console: Console) -> None:
         saved = load_config(folder)
@@ -101,13 +125,59 @@ class Train:
             if name not in names or value != get_option(saved, name):
                 option = name.replace("_", "-")
                 raise ValueError(f"--{option} cannot change when a run is resumed; leave it out")
-        resume(
-            folder,
-            total_steps=self.options.total_steps if "total_steps" in given else None,
+        with self._log(folder) as on_chunk:
+            resume(
+                folder,
+                total_steps=self.options.total_steps if "total_steps" in given else None,
+                eval_episodes=self.eval_episodes,
+                stop_at=self.stop_at,
+                on_chunk=on_chunk,
+                console=console,
+            )
+
+
+@dataclasses.dataclass(frozen=True)
+class Sweep:
+    """Search for options of a training by many short runs; hopeless ones are ended early.
+
+    Every trial is a run folder. A sweep that was stopped continues with the same `--out`.
+
+    Attributes:
+      options: of all trials.
+      search: options to vary: `learning-rate=1e-4..1e-2:log`, `n-step=1..5`, `hidden=128,256`.
+      preset: starting point of all other options; see `train`.
+      config: a JSON file with options to start from instead of a preset.
+      out: folder of the sweep.
+      trials: number of trials.
+      minutes: start no trial after this time.
+      eval_episodes: episodes of the evaluation at the end of a trial.
+    """
+
+    options: Annotated[TrainConfig, tyro.conf.arg(name="")]
+    search: tuple[str, ...] = ()
+    preset: str = "fast"
+    config: pathlib.Path | None = None
+    out: pathlib.Path = pathlib.Path("runs/sweep")
+    trials: int = 20
+    minutes: float | None = None
+    eval_episodes: int = 100
+
+    def run(self, given: frozenset[str]) -> None:
+        """Runs the command."""
+        del given
+        space = parse_space(self.search, self.options)
+        console = make_console()
+        found = sweep(
+            self.options,
+            space,
+            self.out,
+            trials=self.trials,
+            minutes=self.minutes,
             eval_episodes=self.eval_episodes,
-            stop_at=self.stop_at,
             console=console,
         )
+        print(describe_sweep(found, space))
+        print(self.out / "sweep.html")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -309,7 +379,7 @@ class View:
         view(ViewOptions(**dataclasses.asdict(self)))
 
 
-Command = Train | Eval | Play | Figures | Compare | Agents | View
+Command = Train | Eval | Play | Figures | Compare | Agents | View | Sweep
 _COMMANDS: dict[str, type[Command]] = {
     "train": Train,
     "eval": Eval,
@@ -318,6 +388,7 @@ _COMMANDS: dict[str, type[Command]] = {
     "compare": Compare,
     "agents": Agents,
     "view": View,
+    "sweep": Sweep,
 }
 _SUBJECTS = {
     "agent": "an agent's file or a run folder",
@@ -333,7 +404,10 @@ def default_preset() -> str:
     return "fast" if jax.default_backend() == "cpu" else "gpu"
 
 
-def _start(arguments: Sequence[str]) -> Train:
+Trains = TypeVar("Trains", Train, Sweep)
+
+
+def _start(kind: type[Trains], arguments: Sequence[str]) -> Trains:
     """The options that a command line starts from: those of its preset or file, and its task's."""
     first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     for name in ("preset", "config", "task", "algorithm"):
@@ -348,7 +422,7 @@ def _start(arguments: Sequence[str]) -> Train:
         options = parse_run(read_text(pathlib.Path(known.config)), known.config).config
     parts = {"task": known.task, "algorithm": known.algorithm}
     chosen = {name: value for name, value in parts.items() if value is not None}
-    return Train(options=set_train_options(options, chosen), preset=preset)
+    return kind(options=set_train_options(options, chosen), preset=preset)
 
 
 def _parse(arguments: Sequence[str]) -> tuple[Command, frozenset[str]]:
@@ -364,7 +438,9 @@ def _parse(arguments: Sequence[str]) -> tuple[Command, frozenset[str]]:
     check_name("command", arguments[0], _COMMANDS)
     kind = _COMMANDS[arguments[0]]
     if kind is Train:
-        return _parse_train(arguments[1:])
+        return _parse_train(Train, arguments[1:])
+    if kind is Sweep:
+        return _parse_train(Sweep, arguments[1:])
     known = _annotations(kind)
     subject = next(iter(known))
     values, others = read_arguments(arguments[1:], known | {subject: pathlib.Path})
@@ -383,9 +459,9 @@ def _subject(kind: type[Command], name: str, command: str, given: Sequence[str])
     return {name: given[0] if kind is Agents else pathlib.Path(given[0])}
 
 
-def _parse_train(arguments: Sequence[str]) -> tuple[Train, frozenset[str]]:
-    start = _start(arguments)
-    own = {name: x for name, x in _annotations(Train).items() if name != "options"}
+def _parse_train(kind: type[Trains], arguments: Sequence[str]) -> tuple[Trains, frozenset[str]]:
+    start = _start(kind, arguments)
+    own = {name: x for name, x in _annotations(kind).items() if name != "options"}
     values, others = read_arguments(arguments, own | flat_annotations(start.options))
     _check_none(others)
     options = {name: value for name, value in values.items() if name not in own}
@@ -408,8 +484,9 @@ def _check_none(others: Sequence[str]) -> None:
 
 def _help(arguments: Sequence[str]) -> NoReturn:
     """Prints the help, which shows the values of the preset, and the options of the task."""
-    with_preset = Annotated[Train, tyro.conf.subcommand("train", default=_start(arguments))]
-    commands: Any = with_preset | Eval | Play | Figures | Compare | Agents | View
+    train_ = Annotated[Train, tyro.conf.subcommand("train", default=_start(Train, arguments))]
+    sweep_ = Annotated[Sweep, tyro.conf.subcommand("sweep", default=_start(Sweep, arguments))]
+    commands: Any = train_ | Eval | Play | Figures | Compare | Agents | View | sweep_
     first = [name for name in arguments[:1] if name in _COMMANDS]
     tyro.cli(
         commands,

@@ -60,21 +60,25 @@ class Panel:
         if choices:
             agent = self._gui.add_dropdown("agent", list(choices), initial_value=chosen)
             agent.on_update(lambda _: send("choose", agent.value))
-        self._run_buttons(session, speed)
+        self._pause = self._gui.add_button("Pause")
+        self._pause.on_click(lambda _: send("pause", None))
+        self._group("episode", {"step": ("step", None), "next seed": ("restart", None)})
+        self._hands(session, objects)
         self._gui.add_markdown("**What the agent sees**" if choices else "**The camera**")
-        self._image = self._gui.add_image(enlarge(session.seen.image), format="png")
+        self._image = self._gui.add_image(enlarge(np.asarray(session.seen.image)), format="png")
         self._facts = self._gui.add_html("")
         self._q = self._gui.add_html("", visible=session.simulation.has_agent)
         self._reward = self._gui.add_html("")
-        self._hand_buttons(session, objects)
+        with self._gui.add_folder("Settings"):
+            self._settings(session, speed)
+        with self._gui.add_folder("Joints", expand_by_default=False):
+            for joint in range(session.simulation.env.arm.num_joints):
+                name = self._actions[2 * joint].rpartition(" ")[0]
+                self._group(name, {"−": ("act", 2 * joint), "+": ("act", 2 * joint + 1)})
 
-    def _run_buttons(self, session: Session, speed: float) -> None:
+    def _settings(self, session: Session, speed: float) -> None:
         gui, send = self._gui, self._send
-        self._pause = gui.add_button("Pause")
-        self._pause.on_click(lambda _: send("pause", None))
-        gui.add_button("Step").on_click(lambda _: send("step", None))
-        gui.add_button("Next seed").on_click(lambda _: send("restart", None))
-        self._seed = gui.add_number("seed", session.seed, min=0, max=2**31 - 1, step=1)
+        self._seed: Any = gui.add_number("seed", session.seed, min=0, max=2**31 - 1, step=1)
         self._seed.on_update(self._changed("restart", lambda: int(self._seed.value)))
         rate = gui.add_slider("steps/s", min=1, max=100, step=1, initial_value=round(speed))
         rate.on_update(lambda _: send("speed", float(rate.value)))
@@ -96,20 +100,20 @@ class Panel:
 
         return changed
 
-    def _hand_buttons(self, session: Session, objects: Sequence[str]) -> None:
-        gui, count = self._gui, len(self._actions)
-        with gui.add_folder("By hand"):
-            self._group("gripper", {"open": count - 2, "close": count - 1}, "act")
-            for name in objects:
-                self._group(f"push {name}", {side: (name, x) for side, x in PUSHES.items()}, "push")
-        with gui.add_folder("Joints", expand_by_default=False):
-            for joint in range(session.simulation.env.arm.num_joints):
-                name = self._actions[2 * joint].rpartition(" ")[0]
-                self._group(name, {"−": 2 * joint, "+": 2 * joint + 1}, "act")
+    def _hands(self, session: Session, objects: Sequence[str]) -> None:
+        arm = session.simulation.env.arm
+        self._group(
+            "gripper", {"open": ("act", arm.open_action), "close": ("act", arm.close_action)}
+        )
+        for name in objects:
+            self._group(
+                f"push {name}", {side: ("push", (name, shift)) for side, shift in PUSHES.items()}
+            )
 
-    def _group(self, label: str, values: dict[str, Any], name: str) -> None:
-        group = self._gui.add_button_group(label, list(values))
-        group.on_click(lambda _: self._send(name, values[group.value]))
+    def _group(self, label: str, wishes: dict[str, tuple[str, Any]]) -> None:
+        """Buttons in one row, and what each of them sends."""
+        group = self._gui.add_button_group(label, list(wishes))
+        group.on_click(lambda _: self._send(*wishes[group.value]))
 
     def say(self, text: str) -> None:
         """Says what is being done, until `show` is called."""
@@ -132,7 +136,7 @@ class Panel:
             self._seed.value = session.seed
         self._status.content = _status(session, paused, agent, error)
         self._training.content, self._training.visible = training, bool(training)
-        self._image.image = enlarge(session.seen.image)
+        self._image.image = enlarge(np.asarray(session.seen.image))
         measured = {
             name: bool(x) if np.asarray(x).dtype == bool else float(x)
             for name, x in session.seen.measured.items()

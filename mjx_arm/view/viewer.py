@@ -113,7 +113,7 @@ class Viewer:
         self._choice: Choice | None = None
         self._agent: Agent | None = None
         self._version, self._env_steps, self._training = 0, 0, ""
-        viser = _import_viser()
+        module = _import_viser()
         if is_scene(options.subject):
             env = scene_env(str(options.subject), options.task, **options.env_options)
             self.session = self._make_session(env, None)
@@ -122,7 +122,7 @@ class Viewer:
                 raise ValueError("--task is for a scene; an agent brings its own")
             self._choices = find_choices(options.subject)
             self.session = self._load(self._choices[0], options.seed)
-        self.server: viser.ViserServer = _serve(viser, options, self._title)
+        self.server: viser.ViserServer = _serve(module, options, self._title)
         self._stage = Stage(self.server, lambda position: self._wish("drag", position))
         self._panel = self._build()
         now = time.monotonic()
@@ -218,7 +218,8 @@ class Viewer:
         )
 
     def _choose(self, name: str) -> None:
-        """Shows another agent, in the same episode."""
+        """Shows another agent, in the episode of the same seed."""
+        before = self.session
         (choice,) = [choice for choice in self._choices if choice.name == name]
         self._panel.say(f"loading {choice.name}: some seconds")
         try:
@@ -227,6 +228,7 @@ class Viewer:
             self._error = f"{choice.name} cannot be shown: {error}"
             return
         self._error = ""
+        self.session.epsilon, self.session.actor = before.epsilon, before.actor
         self.server.gui.reset()
         self._panel = self._build()
 
@@ -295,9 +297,11 @@ def _import_viser() -> Any:
         raise ValueError("the viewer needs the extra 'view': pip install 'mjx-arm[view]'") from None
 
 
-def _serve(viser: Any, options: ViewOptions, title: str) -> Any:
+def _serve(module: Any, options: ViewOptions, title: str) -> Any:
     try:
-        server = viser.ViserServer(host=options.host, port=options.port, label=title, verbose=False)
+        server = module.ViserServer(
+            host=options.host, port=options.port, label=title, verbose=False
+        )
     except OSError as error:
         raise ValueError(
             f"the viewer cannot listen on {options.host}, port {options.port} "
