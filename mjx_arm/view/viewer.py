@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import importlib
+import io
 import ipaddress
 import pathlib
 import queue
@@ -299,15 +301,18 @@ def _import_viser() -> Any:
 
 def _serve(module: Any, options: ViewOptions, title: str) -> Any:
     try:
-        server = module.ViserServer(
-            host=options.host, port=options.port, label=title, verbose=False
-        )
+        # It prints a box with its address whatever `verbose` is.
+        with contextlib.redirect_stdout(io.StringIO()):
+            server = module.ViserServer(
+                host=options.host, port=options.port, label=title, verbose=False
+            )
     except OSError as error:
         raise ValueError(
             f"the viewer cannot listen on {options.host}, port {options.port} "
             f"({error.strerror or error}): give --port another one"
         ) from None
-    # A shared view would travel over another host.
+    # A shared view would travel over another host, and any visitor may ask for it.
+    server.request_share_url = lambda verbose=True: None
     server.gui.configure_theme(show_logo=False, show_share_button=False)
     return server
 
