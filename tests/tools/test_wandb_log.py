@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import json
 import math
+import pathlib
 import sys
+from collections.abc import Iterator
+from typing import Any
 
 import pytest
 from made_runs import make_run, row
@@ -12,6 +15,8 @@ from made_runs import make_run, row
 from mjx_arm.cli import main
 from mjx_arm.tools.wandb_log import WandbLog
 from mjx_arm.training.run_folder import load_run
+
+_BLOCK, _WHOLE, _LAST = 32_768, 1, 4
 
 
 @pytest.fixture(autouse=True)
@@ -21,30 +26,44 @@ def offline(monkeypatch, tmp_path):
     monkeypatch.setenv("WANDB_CONFIG_DIR", str(tmp_path / "config"))
 
 
-def read_log(path) -> dict[str, list]:
+def records(path: pathlib.Path) -> Iterator[bytes]:
+    """The records of a log in LevelDB's format, after wandb's own header of 7 bytes."""
+    content, at, record = path.read_bytes(), 7, b""
+    while at + 7 <= len(content):
+        left = _BLOCK - at % _BLOCK
+        if left < 7:
+            at += left
+            continue
+        # Of each piece: 4 bytes of checksum, 2 of length, 1 that says which piece it is.
+        length, kind = int.from_bytes(content[at + 4 : at + 6], "little"), content[at + 6]
+        record += content[at + 7 : at + 7 + length]
+        at += 7 + length
+        if kind in (_WHOLE, _LAST):
+            yield record
+            record = b""
+
+
+def read_log(path: pathlib.Path) -> dict[str, Any]:
     """What an offline run holds: rows of metrics, its summary, configuration and name."""
     from wandb.proto import wandb_internal_pb2
-    from wandb.sdk.internal.datastore import DataStore
 
-    store, found = DataStore(), {"rows": [], "summary": {}, "config": {}, "name": ""}
-    store.open_for_scan(str(path))
-    while (data := store.scan_data()) is not None:
+    found: dict[str, Any] = {"rows": [], "summary": {}, "config": {}, "name": ""}
+    for data in records(path):
         record = wandb_internal_pb2.Record()
         record.ParseFromString(data)
         kind = record.WhichOneof("record_type")
         if kind == "history":
-            items = record.history.item
-            found["rows"].append(
-                {(item.key or item.nested_key[0]): json.loads(item.value_json) for item in items}
-            )
+            found["rows"].append(_items(record.history.item))
         elif kind == "summary":
-            for item in record.summary.update:
-                found["summary"][item.key or item.nested_key[0]] = json.loads(item.value_json)
+            found["summary"] |= _items(record.summary.update)
         elif kind == "run":
             found["name"] = record.run.display_name
-            for item in record.run.config.update:
-                found["config"][item.key] = json.loads(item.value_json)
+            found["config"] |= _items(record.run.config.update)
     return found
+
+
+def _items(items: Any) -> dict[str, Any]:
+    return {item.key or ".".join(item.nested_key): json.loads(item.value_json) for item in items}
 
 
 @pytest.mark.slow
