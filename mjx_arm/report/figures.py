@@ -122,6 +122,8 @@ def draw_groups(groups: Mapping[str, Sequence[pathlib.Path]]) -> list[tuple[str,
         axes = figure.subplots()
         for (name, seeds), colour in zip(runs.items(), itertools.cycle(_COLOURS), strict=False):
             _draw_group(axes, panel, x_name, seeds, name, colour)
+        if not any(np.size(line.get_xdata()) for line in axes.get_lines()):
+            axes.text(0.5, 0.5, _why_empty(panel), transform=axes.transAxes, ha="center")
         _finish(axes, panel, x_name, legend=True)
         pictures.append((panel.title, _svg(figure, panel.title)))
     return pictures
