@@ -67,7 +67,7 @@ from mjx_arm.training.loop import (
     summarise,
 )
 from mjx_arm.training.memory import check_memory, memory_plan, working_memory
-from mjx_arm.training.objects import Objects, check_record, record
+from mjx_arm.training.objects import Objects, check_record, only_here, record
 from mjx_arm.training.run_folder import (
     EVALUATION,
     SavedRun,
@@ -156,6 +156,8 @@ def train(
     trainer = _prepare(config, objects, console)
     config = trainer.config
     recorded = record(config, objects)
+    for sentence in only_here(recorded):
+        console.print(f"[yellow]warning: {sentence}[/yellow]", soft_wrap=True)
     start = None if init_from is None else _read_policy(trainer, pathlib.Path(init_from))
     folder = (
         new_run_folder(config.env.env) if folder is None else prepare_folder(pathlib.Path(folder))
