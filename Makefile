@@ -20,13 +20,14 @@ STAMP := $(VENV)/.locked-$(LOCK)
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 SUPPORTED := import sys; sys.exit(sys.version_info[:2] not in {(3, 11), (3, 12), (3, 13)})
 
-.PHONY: help setup train test test-slow peers test-peers format lock lock-peers clean
+.PHONY: help setup train test test-slow test-campaign peers test-peers format lock lock-peers clean
 
 help:
 	@echo "make setup      build $(VENV) from the lock; GPU=cuda12 or GPU=cuda13 for NVIDIA"
 	@echo "make train      train; ARGS=\"...\" goes to train.py"
 	@echo "make test       ruff, mypy and the default tests"
 	@echo "make test-slow  the tests marked slow"
+	@echo "make test-campaign  tries to break runs and files, two hours; ARGS=\"--parts kills\" for a part"
 	@echo "make peers      build $(PEERS) with what we are measured against"
 	@echo "make test-peers the tests of the adapters, with trainers of others"
 	@echo "make format     let ruff rewrite the sources"
@@ -60,6 +61,10 @@ test: $(STAMP)
 
 test-slow: $(STAMP)
 	$(BIN)/python -m pytest -m slow
+
+# Outside the repository nothing is written; ARGS="--table FILE" keeps the results.
+test-campaign: $(STAMP)
+	$(BIN)/python benchmarks/campaign.py $(ARGS)
 
 # What we are measured against has an environment of its own, on Linux with Python 3.11. Its torch
 # is the CPU build, which PyTorch has in a place of its own: name that in PIP_FIND_LINKS.
