@@ -499,7 +499,10 @@ class _Loop:
         counts = jax.device_get(counts)
         seconds = time.perf_counter() - before
         last = chunk == config.num_chunks
-        select = config.select_every > 0 and (last or _is_due(config, chunk))
+        # A policy that does not act yet has not learnt yet, and its episodes are the longest.
+        env_steps = jnp.asarray(chunk * config.chunk_length * config.num_envs)
+        acts = bool(self.trainer.algorithm.acts_on_obs(env_steps))
+        select = config.select_every > 0 and (last or (acts and _is_due(config, chunk)))
         if select:
             progress.phase(f"selecting: {config.select_episodes} episodes")
         policy = self.trainer.algorithm.policy(state.learner)
