@@ -446,10 +446,12 @@ def _is_valid(name: str, text: str) -> bool:
     value = mjx_arm.PRESETS["smoke"]
     for convert in (int, float, str):
         try:
-            set_train_options(value, {name: convert(text)})
+            converted = convert(text)
         except (ValueError, OverflowError):
             continue
-        return True
+        with contextlib.suppress(ValueError):
+            set_train_options(value, {name: converted})
+            return True
     return False
 
 

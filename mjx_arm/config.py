@@ -20,6 +20,7 @@ from mjx_arm.options import (
     Positive,
     Share,
     check_name,
+    check_value,
     from_json,
     options,
     set_options,
@@ -313,9 +314,11 @@ def set_train_options(config: TrainConfig, values: Mapping[str, Any]) -> TrainCo
     """
     values = dict(values)
     task = values.pop("task", config.env.task)
+    check_value("task", str, task)
     if task != config.env.task:
         config = dataclasses.replace(config, env=set_env_options(config.env, {"task": task}))
     algorithm = values.pop("algorithm", config.algorithm)
+    check_value("algorithm", str, algorithm)
     if algorithm != config.algorithm:
         check_name("algorithm", algorithm, _ALGORITHMS)
         config = dataclasses.replace(config, algorithm=algorithm, algo=_ALGORITHMS[algorithm]())

@@ -13,9 +13,9 @@ from typing import Any
 _LOCAL = ("<lambda>", "<locals>")
 
 
-def is_reference(text: str) -> bool:
-    """Whether a text has the form `module:name`."""
-    return ":" in text
+def is_reference(text: object) -> bool:
+    """Whether a value is a text of the form `module:name`."""
+    return isinstance(text, str) and ":" in text
 
 
 def reference_to(value: Any) -> str:

@@ -5,6 +5,7 @@ import json
 import math
 from typing import Annotated, Literal
 
+import numpy as np
 import pytest
 from pydantic import Field
 
@@ -251,3 +252,10 @@ def test_every_option_of_every_class_is_described():
             if dataclasses.is_dataclass(group):
                 for name in option_names(type(group)):
                     assert f"      {name}: " in type(group).__doc__, (type(group), name)
+
+
+@pytest.mark.parametrize("name", ["task", "algorithm"])
+@pytest.mark.parametrize("value", [3.5, None, ["lift"], b"dqn", np.array(["lift", "push"])])
+def test_what_is_no_text_is_no_name(name, value):
+    with pytest.raises(ValueError, match=f"^{name} must be text, got "):
+        train_config(**{name: value})

@@ -6,7 +6,16 @@ import dataclasses
 from typing import Any, Literal
 
 from mjx_arm.envs.tasks import TaskConfig, find_task
-from mjx_arm.options import Count, NotNegative, Positive, Size, flat_names, options, set_options
+from mjx_arm.options import (
+    Count,
+    NotNegative,
+    Positive,
+    Size,
+    check_value,
+    flat_names,
+    options,
+    set_options,
+)
 
 Physics = Literal["auto", "native", "mjx", "mjx-warp"]
 ObservationKind = Literal["rgb", "rgbd", "segmentation", "state", "packed"]
@@ -118,6 +127,7 @@ def env_config(env: str = "A", **values: Any) -> EnvConfig:
 def set_env_options(config: EnvConfig, values: dict[str, Any]) -> EnvConfig:
     """The same options with some changed; another task comes with its own options."""
     task = values.get("task", config.task)
+    check_value("task", str, task)
     if task != config.task:
         config = dataclasses.replace(config, task=task, task_options=find_task(task).config())
     return set_options(config, values)
