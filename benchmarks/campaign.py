@@ -55,7 +55,7 @@ from mjx_arm.config import TrainConfig, dump_config, parse_config, set_train_opt
 from mjx_arm.options import flat_names
 from mjx_arm.report.metrics import read_metrics
 
-# A run of seconds that has every phase: compiling, training, selecting, evaluating and drawing.
+# A run of seconds that has every phase: compiling, training, selecting, evaluating and a video.
 TINY = [
     *("--preset", "pixels", "--physics", "native", "--num-envs", "4", "--size", "16", "16"),
     *("--replay-size", "400", "--batch-size", "8", "--learning-starts", "40"),
