@@ -99,6 +99,7 @@ PRESETS: dict[str, TrainConfig] = {
         total_steps=40_000_000,
         select_every=2_097_152,
         select_episodes=200,
+        student_starts=8_000_000,
         teacher_batch_size=8_192,
         student_batch_size=2_048,
         student_updates_per_step=4,

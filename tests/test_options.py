@@ -11,6 +11,7 @@ from pydantic import Field
 
 from mjx_arm.config import (
     TrainConfig,
+    advice,
     dump_config,
     parse_config,
     set_train_options,
@@ -259,3 +260,23 @@ def test_every_option_of_every_class_is_described():
 def test_what_is_no_text_is_no_name(name, value):
     with pytest.raises(ValueError, match=f"^{name} must be text, got "):
         train_config(**{name: value})
+
+
+@pytest.mark.parametrize(
+    ("preset", "options", "sentence"),
+    [
+        ("fast", {}, None),
+        ("gpu", {}, None),
+        ("fast", {"total_steps": 1_200_000}, "the agent that is saved learns from step 1,200,000"),
+        ("pixels", {"num_envs": 8_192}, "a chunk has 1 steps of 8192 environments"),
+        ("pixels", {"replay_size": 3_200}, "the replay holds 50 steps of each environment"),
+        ("pixels", {"num_envs": 512, "chunk_steps": 2**20}, "training samples 0.12 transitions"),
+    ],
+)
+def test_valid_options_that_make_no_sense_get_a_sentence(preset, options, sentence):
+    said = advice(set_train_options(PRESETS[preset], options))
+    assert all("\n" not in x for x in said)
+    if sentence is None:
+        assert said == []
+    else:
+        assert any(x.startswith(sentence) or sentence in x for x in said)
