@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import re
+
 import pytest
 
 from mjx_arm.arguments import read_arguments
-from mjx_arm.cli import Train, _parse, main
+from mjx_arm.cli import Train, _annotations, _parse, main
+from mjx_arm.options import flat_names
 from mjx_arm.presets import PRESETS
 
 
@@ -89,3 +92,14 @@ def test_help_is_help(command, capsys):
         main([*command, "--help"])
     assert ended.value.code == 0
     assert "usage: mjx-arm" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("preset", ["pixels", "fast"])
+def test_the_help_lists_the_options_that_the_command_line_takes(preset, capsys):
+    with pytest.raises(SystemExit):
+        main(["train", "--preset", preset, "--help"])
+    listed = set(re.findall(r"--[a-z][a-z0-9-]*", capsys.readouterr().out))
+    names = {*flat_names(PRESETS[preset]), *_annotations(Train)} - {"options"}
+    taken = {f"--{name.replace('_', '-')}" for name in names}
+    assert taken <= listed
+    assert {x for x in listed - taken if not x.startswith("--no-")} == {"--help"}
