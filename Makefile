@@ -3,6 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 GPU :=
 ARGS :=
+AGENT := agent-b
 
 BIN := $(VENV)/bin
 UV_VERSION := 0.13.9
@@ -20,11 +21,12 @@ STAMP := $(VENV)/.locked-$(LOCK)
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 SUPPORTED := import sys; sys.exit(sys.version_info[:2] not in {(3, 11), (3, 12), (3, 13)})
 
-.PHONY: help setup train test test-slow test-campaign peers test-peers format lock lock-peers clean
+.PHONY: help setup train play test test-slow test-campaign peers test-peers format lock lock-peers clean
 
 help:
 	@echo "make setup      build $(VENV) from the lock; GPU=cuda12 or GPU=cuda13 for NVIDIA"
 	@echo "make train      train; ARGS=\"...\" goes to train.py"
+	@echo "make play       video.mp4 of a shipped agent; AGENT=..., ARGS=\"--env A --out other.mp4\""
 	@echo "make test       ruff, mypy and the default tests"
 	@echo "make test-slow  the tests marked slow"
 	@echo "make test-campaign  tries to break runs and files, two hours; ARGS=\"--parts kills\" for a part"
@@ -52,6 +54,9 @@ $(VENV)/.locked-%: requirements/%.txt
 
 train: $(STAMP)
 	$(BIN)/python train.py $(ARGS)
+
+play: $(STAMP)
+	$(BIN)/mjx-arm play $(AGENT) $(ARGS)
 
 test: $(STAMP)
 	$(BIN)/ruff check .

@@ -45,7 +45,7 @@ def read_arguments(
         texts = [text] if equals else []
         while left and len(texts) < _most_texts(annotation) and not left[0].startswith("--"):
             texts.append(left.pop(0))
-        values[name] = _value(option, name, annotation, texts)
+        values[name] = read_value(option, name, annotation, texts)
     return values, others
 
 
@@ -72,7 +72,18 @@ def _most_texts(annotation: Any) -> float:
     return 1
 
 
-def _value(option: str, name: str, annotation: Any, texts: list[str]) -> Any:
+def read_value(option: str, name: str, annotation: Any, texts: list[str]) -> Any:
+    """The value that texts mean for an option.
+
+    Args:
+      option: what errors call it.
+      name: of the option.
+      annotation: what it may be.
+      texts: as they stand on the command line.
+
+    Raises:
+      ValueError: they mean no value that is allowed.
+    """
     try:
         value = _read(annotation, texts)
     except (ValueError, OverflowError):

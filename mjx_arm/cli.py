@@ -14,7 +14,7 @@ import sys
 import typing
 from collections.abc import Sequence
 from types import FrameType
-from typing import Annotated, Any, NoReturn
+from typing import Annotated, Any, NoReturn, TypeVar
 
 import jax
 import tyro
@@ -28,15 +28,28 @@ from mjx_arm.options import check_name, flat_annotations, flat_names, get_option
 from mjx_arm.presets import PRESETS
 from mjx_arm.report.figures import plot_curves
 from mjx_arm.report.progress import make_console
+from mjx_arm.report.run_page import write_report
 from mjx_arm.report.video import check_video_path, draw_episode, record_episode, write_video
+from mjx_arm.tools.compare import describe, read_result, to_json, write_comparison
+from mjx_arm.tools.search_space import parse_space
+from mjx_arm.tools.sweep import describe_sweep, sweep
+from mjx_arm.tools.wandb_log import WandbLog, import_wandb
+from mjx_arm.tools.zoo import describe_zoo, read_shipped, read_zoo
 from mjx_arm.training.agent import Agent, differences, load_agent
 from mjx_arm.training.evaluate import evaluate
 from mjx_arm.training.loop import EVALUATION, role_key
-from mjx_arm.training.run_folder import load_config, parse_run, read_text, seed_folders
+from mjx_arm.training.run_folder import (
+    load_config,
+    new_run_folder,
+    parse_run,
+    read_text,
+    seed_folders,
+)
 from mjx_arm.training.runner import RunInterruptedError, resume, stop_signals, train
+from mjx_arm.view.viewer import ViewOptions, view
 
 # Options that may change when a run is resumed.
-_CHANGEABLE = frozenset({"resume", "total_steps", "eval_episodes", "stop_at"})
+_CHANGEABLE = frozenset({"resume", "total_steps", "eval_episodes", "stop_at", "wandb"})
 
 
 @dataclasses.dataclass(frozen=True)
@@ -59,6 +72,7 @@ class Train:
       stop_at: end the run when an evaluation that selects has reached this success rate.
       eval_episodes: episodes of the evaluation at the end, by the best agent, at epsilon 0.1 and on
         starts and random numbers that neither training nor the selection has seen.
+      wandb: also log the run to Weights & Biases; `WANDB_MODE=offline` keeps it in the run folder.
     """
 
     options: Annotated[TrainConfig, tyro.conf.arg(name="")]
@@ -69,6 +83,7 @@ class Train:
     init_from: pathlib.Path | None = None
     stop_at: float | None = None
     eval_episodes: int = 200
+    wandb: bool = False
 
     def run(self, given: frozenset[str]) -> None:
         """Runs the command; `given` are the names of the options on the command line."""
@@ -78,14 +93,27 @@ class Train:
             return
         if self.config is None:
             console.print(f"preset: {self.preset}")
-        train(
-            self.options,
-            self.out,
-            eval_episodes=self.eval_episodes,
-            stop_at=self.stop_at,
-            init_from=self.init_from,
-            console=console,
-        )
+        out = self.out
+        if self.wandb and out is None:
+            import_wandb()
+            out = new_run_folder(self.options.env.env)
+        with self._log(out) as on_chunk:
+            train(
+                self.options,
+                out,
+                eval_episodes=self.eval_episodes,
+                stop_at=self.stop_at,
+                init_from=self.init_from,
+                on_chunk=on_chunk,
+                console=console,
+            )
+
+    def _log(
+        self, folder: pathlib.Path | None
+    ) -> contextlib.AbstractContextManager[WandbLog | None]:
+        if not self.wandb or folder is None:
+            return contextlib.nullcontext()
+        return WandbLog(folder)
 
     def _resume(self, folder: pathlib.Path, given: frozenset[str], console: Console) -> None:
         saved = load_config(folder)
@@ -97,13 +125,59 @@ class Train:
             if name not in names or value != get_option(saved, name):
                 option = name.replace("_", "-")
                 raise ValueError(f"--{option} cannot change when a run is resumed; leave it out")
-        resume(
-            folder,
-            total_steps=self.options.total_steps if "total_steps" in given else None,
+        with self._log(folder) as on_chunk:
+            resume(
+                folder,
+                total_steps=self.options.total_steps if "total_steps" in given else None,
+                eval_episodes=self.eval_episodes,
+                stop_at=self.stop_at,
+                on_chunk=on_chunk,
+                console=console,
+            )
+
+
+@dataclasses.dataclass(frozen=True)
+class Sweep:
+    """Search for options of a training by many short runs; hopeless ones are ended early.
+
+    Every trial is a run folder. A sweep that was stopped continues with the same `--out`.
+
+    Attributes:
+      options: of all trials.
+      search: options to vary: `learning-rate=1e-4..1e-2:log`, `n-step=1..5`, `hidden=128,256`.
+      preset: starting point of all other options; see `train`.
+      config: a JSON file with options to start from instead of a preset.
+      out: folder of the sweep.
+      trials: number of trials.
+      minutes: start no trial after this time.
+      eval_episodes: episodes of the evaluation at the end of a trial.
+    """
+
+    options: Annotated[TrainConfig, tyro.conf.arg(name="")]
+    search: tuple[str, ...] = ()
+    preset: str = "fast"
+    config: pathlib.Path | None = None
+    out: pathlib.Path = pathlib.Path("runs/sweep")
+    trials: int = 20
+    minutes: float | None = None
+    eval_episodes: int = 100
+
+    def run(self, given: frozenset[str]) -> None:
+        """Runs the command."""
+        del given
+        space = parse_space(self.search, self.options)
+        console = make_console()
+        found = sweep(
+            self.options,
+            space,
+            self.out,
+            trials=self.trials,
+            minutes=self.minutes,
             eval_episodes=self.eval_episodes,
-            stop_at=self.stop_at,
             console=console,
         )
+        print(describe_sweep(found, space))
+        print(self.out / "sweep.html")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -200,7 +274,7 @@ class Play(_Try):
 
 @dataclasses.dataclass(frozen=True)
 class Figures:
-    """Draw the curves of a run again.
+    """Draw the curves of a run again, and write its report, also while it trains.
 
     Attributes:
       folder: a run folder.
@@ -212,18 +286,116 @@ class Figures:
         """Runs the command."""
         del given
         config = load_config(self.folder)
-        for path in plot_curves(seed_folders(self.folder, config), into=self.folder):
+        seeds = seed_folders(self.folder, config)
+        for path in plot_curves(seeds, into=self.folder):
             print(path)
+        print(write_report(self.folder, config, seeds))
 
 
-Command = Train | Eval | Play | Figures
+@dataclasses.dataclass(frozen=True)
+class Compare:
+    """Put runs side by side: success with 95 % intervals, time to a success rate, options.
+
+    Attributes:
+      runs: run folders; the others are compared with the first.
+      out: a page to write, ending in `.html`, with the curves of all runs in one picture.
+      json: print one JSON array.
+    """
+
+    runs: tyro.conf.Positional[tuple[pathlib.Path, ...]]
+    out: pathlib.Path | None = None
+    json: bool = False
+
+    def run(self, given: frozenset[str]) -> None:
+        """Runs the command."""
+        del given
+        results = [read_result(folder) for folder in self.runs]
+        print(json.dumps(to_json(results)) if self.json else describe(results))
+        if self.out is not None:
+            write_comparison(results, self.out)
+            print(self.out, file=sys.stderr if self.json else sys.stdout)
+
+
+@dataclasses.dataclass(frozen=True)
+class Agents:
+    """List the agents that come with the package, or show the card of one.
+
+    Attributes:
+      agent: name of an agent whose card to show.
+      json: print JSON: an array of all agents, or one object.
+    """
+
+    agent: tyro.conf.Positional[str | None] = None
+    json: bool = False
+
+    def run(self, given: frozenset[str]) -> None:
+        """Runs the command."""
+        del given
+        if self.agent is not None:
+            agent = read_shipped(self.agent)
+            print(json.dumps(agent.to_json()) if self.json else agent.card.rstrip())
+            return
+        agents = read_zoo()
+        if self.json:
+            print(json.dumps([agent.to_json() for agent in agents]))
+            return
+        print(describe_zoo(agents))
+        print("\nmjx-arm agents NAME shows its card; mjx-arm play NAME records a video.")
+
+
+@dataclasses.dataclass(frozen=True)
+class View:
+    """Watch an agent in the browser: its Q-values, what it sees; step, push the cube by hand.
+
+    An agent of a run that still trains is loaded again as often as the run saves it.
+
+    Attributes:
+      subject: an agent, a run folder, or the name or path of a scene.
+      env: environment, `A` or `B`; by default the agent's own, and `A` for a scene.
+      task: of a scene; by default the one that the scene was made for.
+      physics: backend; by default native on a CPU and mjx on other devices.
+      seed: of the first episode.
+      epsilon: share of random actions.
+      max_steps: iterations until an episode is truncated.
+      host: address to listen on. Whoever reaches an address other than 127.0.0.1 can work the
+        viewer.
+      port: to listen on.
+    """
+
+    subject: tyro.conf.Positional[pathlib.Path]
+    env: str | None = None
+    task: str | None = None
+    physics: str | None = None
+    seed: int = 0
+    epsilon: float = 0.1
+    max_steps: int = 1_000
+    host: str = "127.0.0.1"
+    port: int = 8080
+
+    def run(self, given: frozenset[str]) -> None:
+        """Runs the command."""
+        del given
+        check_device()
+        view(ViewOptions(**dataclasses.asdict(self)))
+
+
+Command = Train | Eval | Play | Figures | Compare | Agents | View | Sweep
 _COMMANDS: dict[str, type[Command]] = {
     "train": Train,
     "eval": Eval,
     "play": Play,
     "figures": Figures,
+    "compare": Compare,
+    "agents": Agents,
+    "view": View,
+    "sweep": Sweep,
 }
-_SUBJECTS = {"agent": "an agent's file or a run folder", "folder": "a run folder"}
+_SUBJECTS = {
+    "agent": "an agent's file or a run folder",
+    "folder": "a run folder",
+    "runs": "run folders",
+    "subject": "an agent, a run folder or a scene",
+}
 
 
 def default_preset() -> str:
@@ -232,7 +404,10 @@ def default_preset() -> str:
     return "fast" if jax.default_backend() == "cpu" else "gpu"
 
 
-def _start(arguments: Sequence[str]) -> Train:
+Trains = TypeVar("Trains", Train, Sweep)
+
+
+def _start(kind: type[Trains], arguments: Sequence[str]) -> Trains:
     """The options that a command line starts from: those of its preset or file, and its task's."""
     first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     for name in ("preset", "config", "task", "algorithm"):
@@ -247,7 +422,7 @@ def _start(arguments: Sequence[str]) -> Train:
         options = parse_run(read_text(pathlib.Path(known.config)), known.config).config
     parts = {"task": known.task, "algorithm": known.algorithm}
     chosen = {name: value for name, value in parts.items() if value is not None}
-    return Train(options=set_train_options(options, chosen), preset=preset)
+    return kind(options=set_train_options(options, chosen), preset=preset)
 
 
 def _parse(arguments: Sequence[str]) -> tuple[Command, frozenset[str]]:
@@ -263,19 +438,30 @@ def _parse(arguments: Sequence[str]) -> tuple[Command, frozenset[str]]:
     check_name("command", arguments[0], _COMMANDS)
     kind = _COMMANDS[arguments[0]]
     if kind is Train:
-        return _parse_train(arguments[1:])
+        return _parse_train(Train, arguments[1:])
+    if kind is Sweep:
+        return _parse_train(Sweep, arguments[1:])
     known = _annotations(kind)
     subject = next(iter(known))
     values, others = read_arguments(arguments[1:], known | {subject: pathlib.Path})
-    if not others:
-        raise ValueError(f"{arguments[0]} needs {subject.upper()}, {_SUBJECTS[subject]}")
-    _check_none(others[1:])
-    return kind(**{**values, subject: pathlib.Path(others[0])}), frozenset(values)
+    return kind(**{**values, **_subject(kind, subject, arguments[0], others)}), frozenset(values)
 
 
-def _parse_train(arguments: Sequence[str]) -> tuple[Train, frozenset[str]]:
-    start = _start(arguments)
-    own = {name: x for name, x in _annotations(Train).items() if name != "options"}
+def _subject(kind: type[Command], name: str, command: str, given: Sequence[str]) -> dict[str, Any]:
+    """The argument of a command that has no `--`, by its name; empty where it may be left out."""
+    if not given and kind is not Agents:
+        raise ValueError(f"{command} needs {name.upper()}, {_SUBJECTS[name]}")
+    if kind is Compare:
+        return {name: tuple(pathlib.Path(text) for text in given)}
+    _check_none(given[1:])
+    if not given:
+        return {}
+    return {name: given[0] if kind is Agents else pathlib.Path(given[0])}
+
+
+def _parse_train(kind: type[Trains], arguments: Sequence[str]) -> tuple[Trains, frozenset[str]]:
+    start = _start(kind, arguments)
+    own = {name: x for name, x in _annotations(kind).items() if name != "options"}
     values, others = read_arguments(arguments, own | flat_annotations(start.options))
     _check_none(others)
     options = {name: value for name, value in values.items() if name not in own}
@@ -298,8 +484,9 @@ def _check_none(others: Sequence[str]) -> None:
 
 def _help(arguments: Sequence[str]) -> NoReturn:
     """Prints the help, which shows the values of the preset, and the options of the task."""
-    with_preset = Annotated[Train, tyro.conf.subcommand("train", default=_start(arguments))]
-    commands: Any = with_preset | Eval | Play | Figures
+    train_ = Annotated[Train, tyro.conf.subcommand("train", default=_start(Train, arguments))]
+    sweep_ = Annotated[Sweep, tyro.conf.subcommand("sweep", default=_start(Sweep, arguments))]
+    commands: Any = train_ | Eval | Play | Figures | Compare | Agents | View | sweep_
     first = [name for name in arguments[:1] if name in _COMMANDS]
     tyro.cli(
         commands,

@@ -62,7 +62,7 @@ def test_a_run_leaves_everything(run_folder):
         *("config.json", "metrics.jsonl", "tensorboard", "evaluation.json"),
         *("last.safetensors", "best.safetensors"),
         *("checkpoints", ".lock"),
-        *("figure3.png", "learning.png", "policy.mp4"),
+        *("figure3.png", "learning.png", "policy.mp4", "report.html"),
     }
     rows = read_metrics(run_folder)
     assert [row["env_steps"] for row in rows] == [200, 400]

@@ -33,7 +33,11 @@ FORBIDDEN = {
     "report": ("presets", "networks", "training", "interop", "cli"),
     "interop": ("config", "presets", "networks", "algos", "training", "report", "cli"),
     "training": ("interop", "cli", "presets"),
+    "tools": ("interop", "cli", "presets", "view"),
+    "view": ("interop", "cli", "presets", "tools"),
 }
+# Only the command line imports these.
+OUTERMOST = ("tools", "view")
 
 
 def modules(part: str) -> list[pathlib.Path]:
@@ -75,6 +79,12 @@ def test_imports_go_downward(part):
         # `from mjx_arm import ...` is everything at once.
         assert "*" not in found, path
         assert not found & set(FORBIDDEN[part]), path
+
+
+def test_only_the_command_line_imports_the_tools():
+    for path in sorted(PACKAGE.rglob("*.py")):
+        if path.name != "cli.py" and path.relative_to(PACKAGE).parts[0] not in OUTERMOST:
+            assert not parts_of(imported(path)) & set(OUTERMOST), path
 
 
 def test_every_part_of_the_package_is_in_the_table():

@@ -56,12 +56,12 @@ def test_folder_that_is_no_environment_is_left_alone(tmp_path: Path) -> None:
     assert (tmp_path / "thesis.tex").exists()
 
 
-@pytest.mark.parametrize("target", ["setup", "train", "test", "test-slow"])
+@pytest.mark.parametrize("target", ["setup", "train", "play", "test", "test-slow"])
 def test_half_an_environment_is_built_again(target: str, venv: Path) -> None:
     assert BUILDS in make("--dry-run", target, f"VENV={venv}").stdout
 
 
-@pytest.mark.parametrize("target", ["setup", "train", "test", "test-slow"])
+@pytest.mark.parametrize("target", ["setup", "train", "play", "test", "test-slow"])
 def test_whole_environment_is_built_again_only_for_a_newer_lock(target: str, venv: Path) -> None:
     stamp = venv / ".locked-cpu"
     stamp.touch()
@@ -78,3 +78,9 @@ def test_gpu_environment_is_kept_by_all_but_setup(venv: Path) -> None:
     assert f"{BUILDS} --only-binary :all: -r requirements/cuda13.txt" in other
     plain = make("--dry-run", "setup", f"VENV={venv}").stdout
     assert f"{BUILDS} --only-binary :all: -r requirements/cpu.txt" in plain
+
+
+def test_play_records_an_agent(venv: Path) -> None:
+    (venv / ".locked-cpu").touch()
+    lines = make("--dry-run", "play", f"VENV={venv}", "ARGS=--env A").stdout.splitlines()
+    assert lines[-1] == f"{venv}/bin/mjx-arm play agent-b --env A"

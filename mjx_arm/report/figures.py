@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+import io
 import itertools
 import pathlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Literal
 
+import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -70,15 +73,97 @@ def plot_curves(folders: Sequence[pathlib.Path], into: pathlib.Path) -> list[pat
     Raises:
       ValueError: a folder holds no metrics.
     """
-    runs = [_columns(folder) for folder in folders]
-    names = [folder.name for folder in folders]
-    # A user's own algorithm need not have a loss.
-    learning = [panel for panel in _LEARNING if panel.column in runs[0]]
-    learning += _task_panels(runs[0])
+    runs, names = _read_runs(folders)
     return [
         _draw(into / "figure3.png", _PAPER, "episode", runs, names),
-        _draw(into / "learning.png", learning, "env_steps", runs, names),
+        _draw(into / "learning.png", _learning_panels(runs[0]), "env_steps", runs, names),
     ]
+
+
+def draw_panels(folders: Sequence[pathlib.Path]) -> list[tuple[str, bytes]]:
+    """Draws each curve of `plot_curves` as an SVG picture of its own.
+
+    Args:
+      folders: with metrics.
+
+    Returns:
+      The title and the content of each picture: those of `learning.png`, then of `figure3.png`.
+
+    Raises:
+      ValueError: a folder holds no metrics.
+    """
+    runs, names = _read_runs(folders)
+    panels = [(panel, "env_steps") for panel in _learning_panels(runs[0])]
+    panels += [(panel, "episode") for panel in _PAPER]
+    return [(panel.title, _draw_svg(panel, x_name, runs, names)) for panel, x_name in panels]
+
+
+def draw_groups(groups: Mapping[str, Sequence[pathlib.Path]]) -> list[tuple[str, bytes]]:
+    """Draws the curves of several runs in one picture each, as `draw_panels` does.
+
+    Args:
+      groups: names of the runs, and the folders of their seeds, with metrics.
+
+    Returns:
+      The title and the content of each picture.
+
+    Raises:
+      ValueError: a folder holds no metrics.
+    """
+    runs = {name: [_columns(folder) for folder in folders] for name, folders in groups.items()}
+    # Runs of different tasks have different metrics; each picture shows the runs that have it.
+    panels: dict[_Panel, str] = {}
+    for seeds in runs.values():
+        panels |= dict.fromkeys(_learning_panels(seeds[0]), "env_steps")
+    panels |= dict.fromkeys(_PAPER, "episode")
+    pictures = []
+    for panel, x_name in panels.items():
+        figure = Figure(figsize=(4.4, 3.3), layout="constrained")
+        axes = figure.subplots()
+        for (name, seeds), colour in zip(runs.items(), itertools.cycle(_COLOURS), strict=False):
+            _draw_group(axes, panel, x_name, seeds, name, colour)
+        if not any(np.size(line.get_xdata()) for line in axes.get_lines()):
+            axes.text(0.5, 0.5, _why_empty(panel), transform=axes.transAxes, ha="center")
+        _finish(axes, panel, x_name, legend=True)
+        pictures.append((panel.title, _svg(figure, panel.title)))
+    return pictures
+
+
+def _draw_group(
+    axes: Axes,
+    panel: _Panel,
+    x_name: str,
+    seeds: Sequence[dict[str, np.ndarray]],
+    name: str,
+    colour: str,
+) -> None:
+    """The curves of one run in one colour."""
+    curves = [_known(seed, x_name, panel.column) for seed in seeds]
+    for x, y in curves:
+        line = y if len(seeds) == 1 else _smooth(y)
+        axes.plot(x, line, color=colour, lw=0.8, alpha=0.35)
+    if len(seeds) == 1:
+        axes.plot(curves[0][0], _smooth(curves[0][1]), color=colour, lw=1.6, label=name)
+    elif (spread := _spread(curves)) is not None:
+        grid, values = spread
+        axes.fill_between(grid, values.min(0), values.max(0), color=colour, alpha=0.15, lw=0)
+        axes.plot(grid, values.mean(0), color=colour, lw=1.6, label=name)
+    if panel.dots is not None:
+        for seed in seeds:
+            x, y = _known(seed, x_name, panel.dots[0])
+            axes.plot(x, y, color=colour, ls="", marker="D", ms=3.5, mec="black")
+
+
+def _read_runs(
+    folders: Sequence[pathlib.Path],
+) -> tuple[list[dict[str, np.ndarray]], list[str]]:
+    return [_columns(folder) for folder in folders], [folder.name for folder in folders]
+
+
+def _learning_panels(columns: dict[str, np.ndarray]) -> list[_Panel]:
+    # A user's own algorithm need not have a loss.
+    known = [panel for panel in _LEARNING if panel.column in columns]
+    return known + _task_panels(columns)
 
 
 def _task_panels(columns: dict[str, np.ndarray]) -> list[_Panel]:
@@ -126,6 +211,22 @@ def _draw(
     return path
 
 
+def _draw_svg(
+    panel: _Panel, x_name: str, runs: list[dict[str, np.ndarray]], names: list[str]
+) -> bytes:
+    figure = Figure(figsize=(4.4, 3.3), layout="constrained")
+    _draw_panel(figure.subplots(), panel, x_name, runs, names)
+    return _svg(figure, panel.title)
+
+
+def _svg(figure: Figure, salt: str) -> bytes:
+    content = io.BytesIO()
+    # Without a salt the names inside of the file are random.
+    with matplotlib.rc_context({"svg.hashsalt": salt}):
+        figure.savefig(content, format="svg", metadata={"Date": None, "Creator": None})
+    return content.getvalue()
+
+
 def _draw_panel(
     axes: Axes,
     panel: _Panel,
@@ -149,6 +250,11 @@ def _draw_panel(
         _draw_spread(axes, panel.column, x_name, runs)
     if empty:
         axes.text(0.5, 0.5, _why_empty(panel), transform=axes.transAxes, ha="center", va="center")
+    _finish(axes, panel, x_name, legend=(len(runs) > 1 or panel.dots is not None) and not empty)
+
+
+def _finish(axes: Axes, panel: _Panel, x_name: str, *, legend: bool) -> None:
+    """Names, units, limits and the legend of a panel."""
     if panel.unit.startswith("share"):
         axes.set_ylim(-0.03, 1.03)
     axes.set_title(panel.title, fontsize=10)
@@ -156,19 +262,35 @@ def _draw_panel(
     axes.set_ylabel(panel.unit)
     axes.xaxis.set_major_locator(MaxNLocator(4))
     axes.grid(alpha=0.3)
-    if (len(runs) > 1 or panel.dots is not None) and not empty:
-        axes.legend(fontsize=7)
+    if legend and axes.get_legend_handles_labels()[0]:
+        axes.legend(fontsize=7, loc=_emptier_corner(axes))
+
+
+def _emptier_corner(axes: Axes) -> Literal["upper right", "lower right"]:
+    """The corner that a curve leaves free: matplotlib's own search warns on a busy machine."""
+    heights = [y for line in axes.get_lines() for y in np.asarray(line.get_ydata(), float)[-1:]]
+    low, high = axes.get_ylim()
+    return "upper right" if heights and np.mean(heights) < (low + high) / 2 else "lower right"
 
 
 def _draw_spread(axes: Axes, column: str, x_name: str, runs: list[dict[str, np.ndarray]]) -> None:
-    """Range and mean of several runs, on a grid that all of them cover."""
-    known = [_known(run, x_name, column) for run in runs]
-    if any(x.size < 2 for x, _ in known):
+    """Range and mean of several runs."""
+    spread = _spread([_known(run, x_name, column) for run in runs])
+    if spread is None:
         return
-    grid = np.linspace(max(x[0] for x, _ in known), min(x[-1] for x, _ in known), 200)
-    values = np.stack([np.interp(grid, x, _smooth(y)) for x, y in known])
+    grid, values = spread
     axes.fill_between(grid, values.min(0), values.max(0), color="0.5", alpha=0.2, lw=0)
     axes.plot(grid, values.mean(0), color="black", lw=1.2, ls="--", label="mean")
+
+
+def _spread(
+    curves: Sequence[tuple[np.ndarray, np.ndarray]],
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """Smoothed curves on a grid that all of them cover: `[200]` and `[n, 200]`."""
+    if any(x.size < 2 for x, _ in curves):
+        return None
+    grid = np.linspace(max(x[0] for x, _ in curves), min(x[-1] for x, _ in curves), 200)
+    return grid, np.stack([np.interp(grid, x, _smooth(y)) for x, y in curves])
 
 
 def _known(run: dict[str, np.ndarray], x_name: str, column: str) -> tuple[np.ndarray, np.ndarray]:

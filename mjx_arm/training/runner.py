@@ -35,6 +35,7 @@ from mjx_arm.report.progress import (
     say_memory,
     say_working_memory,
 )
+from mjx_arm.report.run_page import write_report
 from mjx_arm.report.video import draw_episode, record_episode, write_video
 from mjx_arm.scene import Scene, compile_scene, read_source, scene_exists
 from mjx_arm.training.agent import (
@@ -582,7 +583,13 @@ def _finish(
     if len(folders) > 1:
         for path in plot_curves(folders, into=folder):
             console.print(f"curves: {path}", soft_wrap=True)
-    return [_finish_seed(own, objects, eval_episodes, console) for own in folders]
+    results = [_finish_seed(own, objects, eval_episodes, console) for own in folders]
+    if len(folders) > 1:
+        for own, config in zip(folders, seed_configs(run.config), strict=True):
+            write_report(own, config, [own])
+    report = write_report(folder, run.config, folders)
+    console.print(f"report: {report}", soft_wrap=True)
+    return results
 
 
 def _finish_seed(

@@ -1,0 +1,55 @@
+"""The agents that come with the package, as the command line lists them."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from mjx_arm.cli import main
+from mjx_arm.tools.zoo import read_zoo
+from mjx_arm.training.agent import shipped_agents
+
+
+def test_every_shipped_agent_has_a_card_with_its_name():
+    agents = read_zoo()
+    assert [agent.name for agent in agents] == shipped_agents()
+    for agent in agents:
+        assert agent.card.startswith(f"# {agent.name}\n")
+        assert agent.success != "not evaluated"
+
+
+def test_agents_lists_them(capsys):
+    assert main(["agents"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].split() == ["name", "task", "env", "sees", "trained", "by", "steps", "success"]
+    (line,) = [line for line in lines if line.startswith("agent-b ")]
+    assert "64×64 pixels of front" in line
+    assert "1,441,792" in line
+
+
+def test_agents_prints_json(capsys):
+    assert main(["agents", "--json"]) == 0
+    listed = {agent["name"]: agent for agent in json.loads(capsys.readouterr().out)}
+    assert listed["agent-b"]["env"] == "B"
+    assert main(["agents", "agent-b", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out) == listed["agent-b"]
+
+
+def test_agents_shows_a_card(capsys):
+    assert main(["agents", "agent-b"]) == 0
+    assert "949 of 1,000 held-out episodes" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["agent-x"], "unknown agent 'agent-x': did you mean 'agent-b'?"),
+        (["agent-b", "agent-b"], "unexpected argument 'agent-b'"),
+    ],
+)
+def test_bad_input_gets_one_sentence(arguments, message, capsys):
+    assert main(["agents", *arguments]) == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") == 1

@@ -1,0 +1,240 @@
+"""The viewer in a real browser, which clicks. It must reach no address but this machine's own."""
+
+from __future__ import annotations
+
+import json
+import os
+import pathlib
+import re
+import shutil
+import socket
+import threading
+import time
+
+import flax.traverse_util
+import imageio.v3 as imageio
+import numpy as np
+import pytest
+from made_runs import make_run
+
+from mjx_arm.config import parse_config
+from mjx_arm.scene import SceneSource
+from mjx_arm.training.agent import find_agent, read_agent, save_agent
+from mjx_arm.view.viewer import Viewer, ViewOptions, is_loopback
+
+NAMES = ("chromium", "chromium-browser", "google-chrome")
+CHROMIUM = next(filter(None, map(shutil.which, NAMES)), None)
+# A missing browser fails where all is to be tested.
+NEEDED = os.environ.get("MJX_ARM_REQUIRE_BROWSER") == "1"
+BROWSER = [
+    "--no-sandbox",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+    "--ignore-gpu-blocklist",
+    "--disable-background-networking",
+    "--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1",
+]
+PATIENCE = 120.0
+
+
+def free_port() -> int:
+    with socket.socket() as server:
+        server.bind(("127.0.0.1", 0))
+        return server.getsockname()[1]
+
+
+def save_again(path: pathlib.Path, env_steps: int, scale: float) -> None:
+    """The shipped agent as a training would save it, with other parameters."""
+    metadata, tensors = read_agent(find_agent(pathlib.Path("agent-b")))
+    scaled = {name: np.float32(scale) * x for name, x in tensors.items()}
+    save_agent(
+        path,
+        parse_config(metadata["config"], "test"),
+        flax.traverse_util.unflatten_dict(scaled, sep="/"),
+        scene=SceneSource.from_json(json.loads(metadata["scene"]), "test"),
+        objects={},
+        env_steps=env_steps,
+    )
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory) -> pathlib.Path:
+    """A run that still trains: metrics, and the last agent."""
+    folder = tmp_path_factory.mktemp("runs") / "live"
+    make_run(folder, env="B")
+    save_again(folder / "last.safetensors", 1_000, 1.0)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def viewer(run):
+    """The viewer at work, in a thread of its own."""
+    made = Viewer(ViewOptions(subject=run, port=free_port(), epsilon=0.0))
+    ended, failures = threading.Event(), []
+
+    def work() -> None:
+        try:
+            while not ended.is_set():
+                time.sleep(min(0.05, made.advance()))
+        except BaseException as error:  # shown by the test, which would wait for ever
+            failures.append(error)
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    yield made
+    ended.set()
+    thread.join()
+    made.close()
+    assert not failures
+
+
+@pytest.fixture(scope="module")
+def page(viewer):
+    if CHROMIUM is None:
+        assert not NEEDED, "chromium is not installed"
+        pytest.skip("chromium is not installed")
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=BROWSER)
+        page = browser.new_page(viewport={"width": 1280, "height": 900})
+        page.set_default_timeout(1000 * PATIENCE)
+        page.asked, page.errors = [], []
+        page.on("request", lambda request: page.asked.append(request.url))
+        page.on("pageerror", lambda error: page.errors.append(str(error)))
+        page.goto(viewer.url)
+        page.get_by_role("button", name="Pause", exact=True).wait_for()
+        yield page
+        browser.close()
+
+
+def wait_until(condition, page) -> None:
+    """Until a condition holds; the page's own events are handled meanwhile."""
+    end = time.monotonic() + PATIENCE
+    while not condition():
+        assert time.monotonic() < end
+        page.wait_for_timeout(50)
+
+
+def pause(page) -> None:
+    """Pauses, and waits until nothing moves any more."""
+    if page.get_by_role("button", name="Pause", exact=True).count():
+        page.get_by_role("button", name="Pause", exact=True).click()
+    page.get_by_role("button", name="Continue", exact=True).wait_for()
+    page.get_by_text(re.compile(r"step \d+ · (paused|success|failed)")).wait_for()
+
+
+@pytest.mark.slow
+def test_it_runs_until_it_is_paused(page, viewer):
+    wait_until(lambda: viewer.session.step_count >= 3, page)
+    page.get_by_text(re.compile(r"step \d+ · running")).wait_for()
+    pause(page)
+    step = viewer.session.step_count
+    page.wait_for_timeout(500)
+    assert viewer.session.step_count == step
+
+
+@pytest.mark.slow
+def test_a_step_is_one_iteration(page, viewer):
+    pause(page)
+    step = viewer.session.step_count
+    page.get_by_role("button", name="step", exact=True).click()
+    page.get_by_text(f"step {step + 1} ·").wait_for()
+    assert viewer.session.step_count == step + 1
+
+
+@pytest.mark.slow
+def test_the_scene_the_image_and_the_bars_are_there(page, viewer, tmp_path):
+    page.get_by_text("Q-values").wait_for()
+    page.get_by_text("Reward of the last step").wait_for()
+    assert page.get_by_text("waist −").count() == 1
+    path = tmp_path / "scene.png"
+    page.locator("canvas").first.screenshot(path=path)
+    # The cube is the only thing in the scene that is red.
+    red, green, blue = np.asarray(imageio.imread(path), int)[..., :3].transpose(2, 0, 1)
+    assert np.count_nonzero((red > 2 * green) & (red > 2 * blue) & (red > 60)) > 50
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("button", "action"), [("close", 13), ("open", 12)])
+def test_the_gripper_obeys(page, viewer, button, action):
+    pause(page)
+    page.get_by_role("button", name=button, exact=True).click()
+    wait_until(lambda: viewer.session.outcome.action == action, page)
+    arm = viewer.session.simulation.env.arm
+    low, high = arm.ctrl_range[arm.gripper_ctrl]
+    expected = high if button == "open" else low
+    assert float(viewer.session.state.ctrl[arm.gripper_ctrl]) == pytest.approx(expected)
+
+
+@pytest.mark.slow
+def test_the_cube_is_pushed_by_hand(page, viewer):
+    pause(page)
+    before = viewer.session.position("cube")
+    page.get_by_role("button", name="left", exact=True).click()
+    wait_until(lambda: (viewer.session.position("cube") != before).any(), page)
+    moved = viewer.session.position("cube") - before
+    assert moved == pytest.approx([0.0, 0.02, 0.0], abs=1e-3)
+
+
+@pytest.mark.slow
+def test_another_seed_is_another_episode(page, viewer):
+    pause(page)
+    seed = viewer.session.seed
+    page.get_by_role("button", name="next seed", exact=True).click()
+    page.get_by_text(f"seed {seed + 1} · step 0 ·").wait_for()
+    assert viewer.session.seed == seed + 1
+
+
+@pytest.mark.slow
+def test_a_live_run_is_followed(page, viewer, run):
+    pause(page)
+    q = np.array(viewer.session.seen.q)
+    save_again(run / "last.safetensors", 222_222, 0.5)
+    page.get_by_text("trained for 222,222 steps").wait_for()
+    page.get_by_text("training: 60,000 steps, success 50 %").wait_for()
+    assert (viewer.session.seen.q != q).any()
+
+
+@pytest.mark.slow
+def test_another_agent_is_chosen(page, viewer):
+    pause(page)
+    inputs = page.locator("input:not([type=range])").all()
+    next(each for each in inputs if each.input_value() == "last").click()
+    page.get_by_role("option", name="agent-b", exact=True).click()
+    page.get_by_text("agent-b, trained for 1,441,792 steps").wait_for()
+    assert viewer.session.simulation.has_agent
+
+
+@pytest.mark.slow
+def test_nothing_came_from_another_host(page):
+    hosts = {re.sub(r"^(\w+:)(//[^/:]*)?.*", r"\1\2", url, flags=re.S) for url in page.asked}
+    assert hosts <= {"http://127.0.0.1", "ws://127.0.0.1", "data:", "blob:"}
+    assert page.errors == []
+
+
+@pytest.mark.slow
+def test_it_listens_on_this_machine_alone(viewer):
+    assert ViewOptions(subject=pathlib.Path("x")).host == "127.0.0.1"
+    assert viewer.server.get_host() == "127.0.0.1"
+    # viser would share a view over a host of its own.
+    assert viewer.server.request_share_url() is None
+    other = next(
+        (
+            address[4][0]
+            for address in socket.getaddrinfo(socket.gethostname(), None)
+            if not is_loopback(address[4][0])
+        ),
+        None,
+    )
+    if other is not None:
+        with pytest.raises(OSError, match=r"refused|unreachable"):
+            socket.create_connection((other, viewer.server.get_port()), timeout=5)
+
+
+@pytest.mark.parametrize(
+    ("host", "expected"),
+    [("127.0.0.1", True), ("localhost", True), ("::1", True), ("0.0.0.0", False), ("a.b", False)],
+)
+def test_loopback_addresses_are_known(host, expected):
+    assert is_loopback(host) == expected
