@@ -69,9 +69,7 @@ def _is_elsewhere(address: str) -> bool:
     return bool(urllib.parse.urlsplit(address).netloc)
 
 
-def _broken(
-    path: pathlib.Path, addresses: list[str], pages: dict[pathlib.Path, Page]
-) -> list[str]:
+def _broken(path: pathlib.Path, addresses: list[str], pages: dict[pathlib.Path, Page]) -> list[str]:
     """The links of a page that lead to no file, or to an anchor that its page does not have."""
     found = []
     for address in dict.fromkeys(addresses):

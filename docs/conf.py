@@ -10,7 +10,7 @@ HERE = pathlib.Path(__file__).parent
 sys.path.insert(0, str(HERE))  # results.py
 
 project = "mjx_arm"
-author = copyright = "The mjx_arm authors"  # noqa: A001
+author = copyright = "The mjx_arm authors"
 release = tomllib.loads((HERE.parent / "pyproject.toml").read_text())["project"]["version"]
 
 extensions = [

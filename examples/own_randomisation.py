@@ -52,7 +52,7 @@ def main() -> None:
     env = mjx_arm.make("B", task="varied_lift", placement="always")
     obs, state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), 3))
     print("images", obs.shape, "colours", np.round(state.params["geom_rgba"][:, 0, :3], 2).tolist())
-    print("sliding friction", np.round(state.params["pair_friction"][:, 0, 0], 2).tolist())
+    print("friction, times that of the scene", np.round(state.placement["grip"], 2).tolist())
 
 
 if __name__ == "__main__":
