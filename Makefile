@@ -131,5 +131,5 @@ compile = UV_CUSTOM_COMPILE_COMMAND="make lock" .venv-lock/bin/uv pip compile py
 	@touch $@
 
 clean:
-	rm -rf build dist .mypy_cache .pytest_cache .ruff_cache .venv-lock
+	rm -rf build dist docs/_build .mypy_cache .pytest_cache .ruff_cache .venv-lock
 	find mjx_arm tests benchmarks -name __pycache__ -type d -prune -exec rm -rf {} + 2>/dev/null || true

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import pathlib
+import re
 import sys
-import tomllib
 
 HERE = pathlib.Path(__file__).parent
 sys.path.insert(0, str(HERE))  # results.py
 
 project = "mjx_arm"
 author = copyright = "The mjx_arm authors"
-release = tomllib.loads((HERE.parent / "pyproject.toml").read_text())["project"]["version"]
+package = (HERE.parent / "mjx_arm" / "__init__.py").read_text()
+release = re.search(r'^__version__ = "(.*)"$', package, re.MULTILINE)[1]
 
 extensions = [
     "myst_nb",
