@@ -35,6 +35,9 @@ nb_execution_raise_on_error = True
 nb_execution_cache_path = str(HERE / "_build" / "notebooks")
 nb_merge_streams = True
 
+# Docstrings write code between single backticks.
+default_role = "code"
+
 autodoc_member_order = "bysource"
 autodoc_typehints = "signature"
 autodoc_typehints_format = "short"

@@ -49,6 +49,8 @@ def _throughput(content: Any) -> Table:
         (row["num_envs"], row["stage"], row["shadows"]): row["steps_per_s"]
         for row in content["rows"]
     }
+    measured = {key[1:] for key in rates}
+    columns = {name: column for name, column in columns.items() if column in measured}
     return (
         ["environments", *(f"{name}, steps/s" for name in columns)],
         [

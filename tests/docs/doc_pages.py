@@ -18,7 +18,7 @@ PAGES = [
         if "_build" not in path.parts and path not in NOTEBOOKS
     ),
 ]
-_FENCE = re.compile(r"^```(\S*)\s*$")
+_FENCE = re.compile(r"^```(\S*)")
 _MARK = re.compile(r"^<!-- test: (\w+) -->$")
 
 
