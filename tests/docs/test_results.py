@@ -32,9 +32,12 @@ def test_figures_are_those_of_the_file(tmp_path: pathlib.Path):
 def test_what_is_missing_is_not_measured(tmp_path: pathlib.Path):
     machine = {"cpu": "X", "cores": 2, "jax": "1", "mujoco": "2"}
     row = {"num_envs": 16, "stage": "physics", "shadows": False, "steps_per_s": 1234}
-    (tmp_path / "throughput.json").write_text(json.dumps({"machine": machine, "rows": [row]}))
+    rows = [row, row | {"num_envs": 64, "stage": "render"}]
+    (tmp_path / "throughput.json").write_text(json.dumps({"machine": machine, "rows": rows}))
     text = render("throughput", tmp_path)
+    assert "| environments | physics, steps/s | rendering, steps/s |" in text
     assert "| 16 | 1,234 | not measured |" in text
+    assert "| 64 | not measured | 1,234 |" in text
 
 
 def test_an_unknown_table_is_refused():
