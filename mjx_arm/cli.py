@@ -32,11 +32,21 @@ from mjx_arm.report.video import check_video_path, draw_episode, record_episode,
 from mjx_arm.training.agent import Agent, differences, load_agent
 from mjx_arm.training.evaluate import evaluate
 from mjx_arm.training.loop import EVALUATION, role_key
+from mjx_arm.training.processes import (
+    alone,
+    end_together,
+    is_writer,
+    join_processes,
+    lost_sentence,
+)
 from mjx_arm.training.run_folder import load_config, parse_run, read_text, seed_folders
 from mjx_arm.training.runner import RunInterruptedError, resume, stop_signals, train
 
 # Options that may change when a run is resumed.
-_CHANGEABLE = frozenset({"resume", "total_steps", "eval_episodes", "stop_at"})
+_PROCESSES = ("coordinator", "num_processes", "process_id")
+_CHANGEABLE = frozenset(
+    {"resume", "total_steps", "eval_episodes", "stop_at", "devices", *_PROCESSES}
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,12 +63,17 @@ class Train:
         of a run.
       options: options of the run.
       out: folder for everything the run leaves; by default `runs/` and the time.
-      resume: folder of a run to continue; only `--total-steps`, `--eval-episodes` and `--stop-at`
-        may then be given.
+      resume: folder of a run to continue; only `--total-steps`, `--eval-episodes`, `--stop-at` and
+        the number of devices and processes may then be given.
       init_from: an agent or a run folder whose network the run starts from.
       stop_at: end the run when an evaluation that selects has reached this success rate.
       eval_episodes: episodes of the evaluation at the end, by the best agent, at epsilon 0.1 and on
         starts and random numbers that neither training nor the selection has seen.
+      devices: number of local devices that share the work; by default as many as divide it.
+      coordinator: `HOST:PORT` of process 0, where several processes train one run; each gets the
+        same command but for its number. Slurm, Open MPI and Kubernetes say all three themselves.
+      num_processes: number of processes of the run.
+      process_id: number of this process, from 0.
     """
 
     options: Annotated[TrainConfig, tyro.conf.arg(name="")]
@@ -69,6 +84,10 @@ class Train:
     init_from: pathlib.Path | None = None
     stop_at: float | None = None
     eval_episodes: int = 200
+    devices: int | None = None
+    coordinator: str | None = None
+    num_processes: int | None = None
+    process_id: int | None = None
 
     def run(self, given: frozenset[str]) -> None:
         """Runs the command; `given` are the names of the options on the command line."""
@@ -76,7 +95,7 @@ class Train:
         if self.resume is not None:
             self._resume(self.resume, given, console)
             return
-        if self.config is None:
+        if self.config is None and is_writer():
             console.print(f"preset: {self.preset}")
         train(
             self.options,
@@ -84,6 +103,7 @@ class Train:
             eval_episodes=self.eval_episodes,
             stop_at=self.stop_at,
             init_from=self.init_from,
+            devices=self.devices,
             console=console,
         )
 
@@ -102,6 +122,7 @@ class Train:
             total_steps=self.options.total_steps if "total_steps" in given else None,
             eval_episodes=self.eval_episodes,
             stop_at=self.stop_at,
+            devices=self.devices,
             console=console,
         )
 
@@ -273,7 +294,19 @@ def _parse(arguments: Sequence[str]) -> tuple[Command, frozenset[str]]:
     return kind(**{**values, subject: pathlib.Path(others[0])}), frozenset(values)
 
 
+def _join(arguments: Sequence[str]) -> None:
+    """Meets the other processes of the run, before anything asks jax for its devices."""
+    known = {name: x for name, x in _annotations(Train).items() if name in _PROCESSES}
+    first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    for name in known:
+        first.add_argument(f"--{name.replace('_', '-')}", nargs="?", const="")
+    texts = vars(first.parse_known_args(arguments)[0])
+    own = [f"--{name.replace('_', '-')}={text}" for name, text in texts.items() if text is not None]
+    join_processes(**read_arguments(own, known)[0])
+
+
 def _parse_train(arguments: Sequence[str]) -> tuple[Train, frozenset[str]]:
+    _join(arguments)
     start = _start(arguments)
     own = {name: x for name, x in _annotations(Train).items() if name != "options"}
     values, others = read_arguments(arguments, own | flat_annotations(start.options))
@@ -335,13 +368,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"error: {where}{' '.join(str(error.strerror or error).split())}", file=sys.stderr)
         return 2
     except jax.errors.JaxRuntimeError as error:
-        if "RESOURCE_EXHAUSTED" not in str(error):
+        if "RESOURCE_EXHAUSTED" in str(error):
+            advice = "give a smaller --replay-size, --num-envs or batch size"
+            print(f"error: the device has run out of memory: {advice}", file=sys.stderr)
+        elif alone():
             raise
-        advice = "give a smaller --replay-size, --num-envs or batch size"
-        print(f"error: the device has run out of memory: {advice}", file=sys.stderr)
+        else:
+            print(f"error: {lost_sentence(error)}", file=sys.stderr)
         return 2
     except RunInterruptedError as stop:
-        print(stop, file=sys.stderr)
+        if is_writer():
+            print(stop, file=sys.stderr)
         return 130
     return 0
 
@@ -358,7 +395,9 @@ def run(arguments: Sequence[str] | None = None) -> NoReturn:
         # A terminal or a log that cannot show a character does not end a run.
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")
-    sys.exit(main(arguments))
+    status = main(arguments)
+    end_together(status)
+    sys.exit(status)
 
 
 def _stop(number: int, frame: FrameType | None) -> NoReturn:
