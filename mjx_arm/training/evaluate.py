@@ -22,7 +22,7 @@ from mjx_arm.envs.env import Env
 from mjx_arm.options import Count, check_value
 from mjx_arm.physics import compiler_options
 from mjx_arm.shard import WHOLE, Shard
-from mjx_arm.training.mesh import replicate, shard_of, sharded
+from mjx_arm.training.mesh import fetch, replicate, shard_of, sharded
 
 # Environments side by side, and iterations in one compiled call.
 _MAX_ENVS = 200
@@ -93,6 +93,31 @@ def make_evaluator(
     """
     check_value("episodes", Count, episodes)
     check_epsilon(epsilon)
+    start, advance = make_programs(env, apply, episodes=episodes, epsilon=epsilon, mesh=mesh)
+
+    def evaluate_params(params: Any, key: jax.Array) -> Evaluation:
+        params, run, left = replicate(params, mesh), start(replicate(key, mesh)), 1
+        while left > 0:
+            run, most = advance(params, run)
+            left = int(most)
+        return _summarise(fetch(run.counts), episodes)
+
+    return evaluate_params
+
+
+def make_programs(
+    env: Env,
+    apply: Apply,
+    *,
+    episodes: int,
+    epsilon: float,
+    mesh: jax.sharding.Mesh | None,
+) -> tuple[jax.stages.Wrapped, jax.stages.Wrapped]:
+    """The compiled functions of an evaluator; see `make_evaluator`.
+
+    Returns:
+      `key -> run`, and `(params, run) -> (run, most episodes that an environment has left)`.
+    """
     auto, shard = AutoReset(env), shard_of(mesh)
 
     def advance_run(params: Any, run: _Run) -> tuple[_Run, jax.Array]:
@@ -110,15 +135,7 @@ def make_evaluator(
     start = jax.jit(
         sharded(functools.partial(_start, auto, episodes, shard=shard), mesh, P(), specs)
     )
-
-    def evaluate_params(params: Any, key: jax.Array) -> Evaluation:
-        params, run, left = replicate(params, mesh), start(replicate(key, mesh)), 1
-        while left > 0:
-            run, most = advance(params, run)
-            left = int(most)
-        return _summarise(jax.device_get(run.counts), episodes)
-
-    return evaluate_params
+    return start, advance
 
 
 def _summarise(totals: dict[str, Any], episodes: int) -> Evaluation:
