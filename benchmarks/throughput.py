@@ -34,7 +34,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from machine import machine
-from matplotlib.figure import Figure
 
 import mjx_arm
 from mjx_arm.config import set_train_options
@@ -388,6 +387,9 @@ def memory(row: dict[str, Any]) -> str:
 
 def plot(rows: list[dict[str, Any]], path: pathlib.Path) -> None:
     """Log-log plot of the figures of 64 by 64 pixels without shadows."""
+    # Not on a machine that has only what training itself needs.
+    from matplotlib.figure import Figure
+
     figure = Figure(figsize=(7, 4.5), layout="constrained")
     axes = figure.subplots()
     chosen = [row for row in rows if row["size"] == 64 and not row["shadows"]]

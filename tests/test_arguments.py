@@ -59,7 +59,7 @@ def test_several_texts_make_a_tuple():
         (["train", "--double", "true"], "unexpected argument 'true': options start with --"),
         (["train", "--double=true"], "--double takes no value, got 'true'"),
         (["train", "--storage", "disk"], "--storage must be one of states, pixels, got 'disk'"),
-        (["train", "--joint-noise", "x"], "--joint-noise must be a finite number of at least 0 or None, got 'x'"),
+        (["train", "--joint-noise", "x"], "--joint-noise must be a finite number of at least 0"),
         (["train", "--stop-at", "nan"], "stop_at must be a finite number or None, got nan"),
         (["train", "--out"], "--out must be a path or None, got nothing"),
         (["train", "--eval-episodes", "1e3"], "--eval-episodes must be a whole number, got '1e3'"),
