@@ -41,7 +41,10 @@ def test_several_texts_make_a_tuple():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ([], "give a command: one of train, eval, play, figures; see --help"),
+        (
+            [],
+            "give a command: one of train, eval, play, figures, compare, agents, view, sweep; see",
+        ),
         (["trian"], "unknown command 'trian': did you mean 'train'?"),
         (["train", "--num-env", "3"], "unknown option '--num-env': did you mean '--num-envs'?"),
         (
