@@ -6,6 +6,7 @@ import contextlib
 import dataclasses
 import json
 import math
+import os
 import pathlib
 import shlex
 import signal
@@ -503,7 +504,7 @@ class _Loop:
         per_chunk = config.chunk_length * config.num_envs
         with contextlib.ExitStack() as stack:
             stack.enter_context(_offering(checkpoints))
-            interruption = stack.enter_context(_Interruption())
+            interruption = stack.enter_context(_Interruption(self.folder))
             total = config.num_chunks * per_chunk
             progress = stack.enter_context(RunProgress(self.console, total, done * per_chunk))
             results = self._results(started)
@@ -523,10 +524,7 @@ class _Loop:
                         result.save_last(own, chunk * per_chunk)
                     checkpoints.save(chunk * config.chunk_length, state)
                 if asked and not last:
-                    command = shlex.join(
-                        [sys.executable, "-m", "mjx_arm", "train", "--resume", str(self.folder)]
-                    )
-                    raise RunInterruptedError(f"saved; continue with: {command}")
+                    raise RunInterruptedError(f"saved; {_how_to_continue(self.folder)}")
                 if reached:
                     self.console.print(f"stopped: every seed has reached {self.stop_at}")
                     return
@@ -613,11 +611,21 @@ def _is_due(config: TrainConfig, chunk: int) -> bool:
     return chunk * per_chunk // config.select_every > (chunk - 1) * per_chunk // config.select_every
 
 
-class _Interruption:
-    """Turns the first signal into a wish to stop after the chunk; the second acts as before."""
+def _how_to_continue(folder: pathlib.Path) -> str:
+    resume = ["-m", "mjx_arm", "train", "--resume", str(folder)]
+    return f"continue with: {shlex.join([sys.executable, *resume])}"
 
-    def __init__(self) -> None:
+
+class _Interruption:
+    """Turns the first signal into a wish to stop after the chunk; a second Ctrl-C acts as before.
+
+    Args:
+      folder: of the run, for what it says.
+    """
+
+    def __init__(self, folder: pathlib.Path) -> None:
         self.asked = False
+        self._folder = folder
         self._before: dict[int, Any] = {}
 
     def __enter__(self) -> Self:
@@ -641,8 +649,17 @@ class _Interruption:
         before = self._before[number]
         # Schedulers may send theirs more than once: only a second Ctrl-C means at once.
         if self.asked and number == signal.SIGINT and callable(before):
+            _say(f"steps since the newest checkpoint are lost; {_how_to_continue(self._folder)}")
             before(number, frame)
+        if not self.asked and number == signal.SIGINT:
+            _say("saving after this chunk; a second Ctrl-C ends the run at once, without saving")
         self.asked = True
+
+
+def _say(sentence: str) -> None:
+    """Prints from a signal handler, which may have interrupted another print."""
+    with contextlib.suppress(OSError):  # the terminal may be gone
+        os.write(2, f"{sentence}\n".encode(errors="replace"))
 
 
 def _finish_on_writer(
