@@ -13,6 +13,7 @@ import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
 from mjx_arm.report.metrics import read_metrics
@@ -267,10 +268,19 @@ def _finish(axes: Axes, panel: _Panel, x_name: str, *, legend: bool) -> None:
 
 
 def _emptier_corner(axes: Axes) -> Literal["upper right", "lower right"]:
-    """The corner that a curve leaves free: matplotlib's own search warns on a busy machine."""
-    heights = [y for line in axes.get_lines() for y in np.asarray(line.get_ydata(), float)[-1:]]
-    low, high = axes.get_ylim()
-    return "upper right" if heights and np.mean(heights) < (low + high) / 2 else "lower right"
+    """The right corner that the curves leave free.
+
+    Not matplotlib's own search, which warns about the time it takes on a busy machine.
+    """
+    (left, right), (low, high) = axes.get_xlim(), axes.get_ylim()
+    ends = [points[-1] for points in map(_points, axes.get_lines()) if points.size]
+    heights = [y for x, y in ends if x > left + 0.6 * (right - left)]
+    falls = bool(heights) and float(np.mean(heights)) < (low + high) / 2
+    return "upper right" if falls else "lower right"
+
+
+def _points(line: Line2D) -> np.ndarray:
+    return np.asarray(line.get_xydata(), float)
 
 
 def _draw_spread(axes: Axes, column: str, x_name: str, runs: list[dict[str, np.ndarray]]) -> None:

@@ -41,6 +41,7 @@ video, .wide img { width: 100%; max-width: 48rem; height: auto; border-radius: .
 table { border-collapse: collapse; font-variant-numeric: tabular-nums; }
 th, td { text-align: left; padding: .3rem .9rem .3rem 0; border-bottom: 1px solid var(--line);
   vertical-align: top; }
+.scroll:has(thead) :is(th, td) { white-space: nowrap; }
 thead th { color: var(--quiet); font-weight: 600; font-size: .88rem; }
 tbody th { font-weight: 400; }
 tr.changed th, tr.changed td { font-weight: 650; }

@@ -222,16 +222,17 @@ def _groups(
             continue
         if value != usual:
             changed.append(len(rows))
-        rows.append((html.text(field.name.replace("_", "-")), html.text(_shown(value))))
+        rows.append((html.text(field.name.replace("_", "-")), html.text(show_option(value))))
     if rows:
         yield _GROUPS.get(name, name), rows, changed
     for group, value, usual in inner:
         yield from _groups(value, usual, group)
 
 
-def _shown(value: Any) -> str:
+def show_option(value: Any) -> str:
+    """The value of an option as it is read best."""
     if isinstance(value, tuple):
-        return " ".join(map(_shown, value))
+        return " ".join(map(show_option, value))
     if isinstance(value, int) and value >= 10_000:
         return f"{value:,}"
     return str(value) or "–"
@@ -255,5 +256,6 @@ __all__: Sequence[str] = (
     "interval",
     "percent",
     "read_evaluation",
+    "show_option",
     "write_report",
 )

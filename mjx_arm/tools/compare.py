@@ -16,7 +16,7 @@ from mjx_arm.options import flat_names, get_option
 from mjx_arm.report import html
 from mjx_arm.report.figures import draw_groups
 from mjx_arm.report.metrics import read_metrics
-from mjx_arm.report.run_page import duration, interval, percent, read_evaluation
+from mjx_arm.report.run_page import duration, interval, percent, read_evaluation, show_option
 from mjx_arm.tools.zoo import text_table
 from mjx_arm.training.agent import evaluation_config
 from mjx_arm.training.evaluate import newcombe_interval, wilson_interval
@@ -159,7 +159,7 @@ def remarks(results: Sequence[RunResult]) -> list[str]:
         name
         for name in flat_names(judged[0])
         if name in ("env", "task", "scene", "lift")
-        and len({str(_option(config, name)) for config in judged}) > 1
+        and len({_option(config, name) for config in judged}) > 1
     ]
     if unlike:
         said.append(
@@ -183,14 +183,14 @@ def different_options(results: Sequence[RunResult]) -> list[tuple[str, tuple[str
         names |= dict.fromkeys(flat_names(result.config))
     rows = []
     for name in names:
-        values = tuple(str(_option(result.config, name)) for result in results)
+        values = tuple(_option(result.config, name) for result in results)
         if name not in _UNINTERESTING and len(set(values)) > 1:
             rows.append((name.replace("_", "-"), values))
     return rows
 
 
-def _option(config: Any, name: str) -> Any:
-    return get_option(config, name) if name in flat_names(config) else _NONE
+def _option(config: Any, name: str) -> str:
+    return show_option(get_option(config, name)) if name in flat_names(config) else _NONE
 
 
 def describe(results: Sequence[RunResult]) -> str:

@@ -62,8 +62,9 @@ def sweep(
     """Trains with many values of some options, and ranks them by success.
 
     Optuna's TPE sampler suggests the values. A trial ends early where its best selection is below
-    the median of the earlier trials at the same step. Each trial is a run folder like any other.
-    A sweep that was stopped continues when it is started again with the same folder.
+    the median of the earlier trials at the same step. Each trial is a run folder like any other,
+    without the video. A sweep that was stopped continues when it is started again with the same
+    folder.
 
     Args:
       config: the options that do not vary; `select_every` must be above 0.
@@ -195,6 +196,7 @@ def _run_trial(
         _trial_folder(folder, trial.number),
         eval_episodes=eval_episodes,
         on_chunk=look,
+        video=False,
         console=quiet,
     )
     rate = float(np.mean([result.rate for result in results]))

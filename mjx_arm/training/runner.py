@@ -124,6 +124,7 @@ def train(
     init_from: str | pathlib.Path | None = None,
     devices: int | None = None,
     on_chunk: OnChunk | None = None,
+    video: bool = True,
     console: Console | None = None,
     env: Any = None,
     network: Any = None,
@@ -146,6 +147,7 @@ def train(
         many as divide it. 1 is the program for one device.
       on_chunk: called after each chunk with the metrics of each seed and the state, which it may
         read until it returns.
+      video: record an episode at the end.
       console: where it prints; by default the terminal.
       env: an environment of one's own.
       network: a Flax module `observations [B, ...] -> Q-values [B, A]` of one's own.
@@ -182,7 +184,7 @@ def train(
         loop = _Loop(trainer, run, run_chunk, folder, console, stop_at, on_chunk)
         console.print(f"training: {config.total_steps:,} environment steps")
         loop.run(state, 0)
-        return _finish_on_writer(folder, run, objects, eval_episodes, console)
+        return _finish_on_writer(folder, run, objects, eval_episodes, console, video=video)
 
 
 def resume(
@@ -663,13 +665,19 @@ def _say(sentence: str) -> None:
 
 
 def _finish_on_writer(
-    folder: pathlib.Path, run: SavedRun, objects: Objects, eval_episodes: int, console: Console
+    folder: pathlib.Path,
+    run: SavedRun,
+    objects: Objects,
+    eval_episodes: int,
+    console: Console,
+    *,
+    video: bool = True,
 ) -> list[Evaluation]:
     """What `_finish` returns, in every process."""
     results: list[Evaluation] = []
 
     def finish() -> str:
-        results.extend(_finish(folder, run, objects, eval_episodes, console))
+        results.extend(_finish(folder, run, objects, eval_episodes, console, video=video))
         return json.dumps([dataclasses.asdict(result) for result in results])
 
     said = on_writer(finish)
@@ -684,12 +692,14 @@ def _finish(
     objects: Objects,
     eval_episodes: int,
     console: Console,
+    *,
+    video: bool = True,
 ) -> list[Evaluation]:
     folders = seed_folders(folder, run.config)
     if len(folders) > 1:
         for path in plot_curves(folders, into=folder):
             console.print(f"curves: {path}", soft_wrap=True)
-    results = [_finish_seed(own, objects, eval_episodes, console) for own in folders]
+    results = [_finish_seed(own, objects, eval_episodes, console, video=video) for own in folders]
     if len(folders) > 1:
         for own, config in zip(folders, seed_configs(run.config), strict=True):
             write_report(own, config, [own])
@@ -699,7 +709,7 @@ def _finish(
 
 
 def _finish_seed(
-    folder: pathlib.Path, objects: Objects, eval_episodes: int, console: Console
+    folder: pathlib.Path, objects: Objects, eval_episodes: int, console: Console, *, video: bool
 ) -> Evaluation:
     for path in plot_curves([folder], into=folder):
         console.print(f"curves: {path}", soft_wrap=True)
@@ -723,6 +733,8 @@ def _finish_seed(
         f"evaluation: {result.successes} of {result.episodes} episodes succeeded, "
         f"{100 * result.rate:.1f} % (95 % interval {100 * low:.1f} to {100 * high:.1f})"
     )
+    if not video:
+        return result
     console.print("rendering a video")
     episode = record_episode(
         agent.env, agent.apply, agent.params, epsilon=_EVALUATION_EPSILON, key=key

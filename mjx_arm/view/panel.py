@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     import viser
 
 # Edge that the agent's image is enlarged to, at least, pixels.
-_EDGE = 256
+_EDGE = 192
 # How far one push moves an object, m, by the button's name; x points away from the arm's base.
 PUSHES = {
     "away": (0.02, 0.0, 0.0),
@@ -165,7 +165,7 @@ def _status(session: Session, paused: bool, agent: str, error: str) -> str:
 
 
 def enlarge(image: np.ndarray) -> np.ndarray:
-    """An image `[H, W, 3]` with each pixel as a square, at least 256 pixels high."""
+    """An image `[H, W, 3]` with each pixel as a square, at least 192 pixels high."""
     factor = max(1, -(-_EDGE // image.shape[0]))
     return np.repeat(np.repeat(image, factor, axis=0), factor, axis=1)
 

@@ -106,7 +106,7 @@ def _box(size: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def _arc(radius: float, low: float, high: float, height: float) -> list[tuple[float, float]]:
     """Points of a half circle's part, from `low` to `high` in units of pi around `height`."""
-    angles = np.linspace(low, high, _ROUND // 2) * np.pi
+    angles = np.linspace(low, high, _ROUND // 2 + 1) * np.pi
     return [(radius * float(np.cos(a)), height + radius * float(np.sin(a))) for a in angles]
 
 

@@ -70,6 +70,7 @@ def test_a_sweep_ranks_prunes_and_continues(tmp_path):
     assert {trial.value for trial in good} == {1.0}
     for trial in trials:
         assert load_config(trial.folder).env.task == trial.values["task"]
+        assert not (trial.folder / "policy.mp4").exists()
         rows = read_metrics(trial.folder)
         assert (trial.folder / "report.html").is_file() == (trial.state == "complete")
         # A pruned trial did not run to its end.

@@ -88,6 +88,25 @@ def test_an_offline_run_has_metrics_options_and_results(tmp_path):
         assert found["summary"]["evaluation"]["successes"] == successes
 
 
+@pytest.mark.slow
+def test_a_training_is_logged_and_a_resumed_one_continues_there(tmp_path):
+    folder = tmp_path / "run"
+    options = (
+        "--preset state --physics native --num-envs 4 --replay-size 400 --batch-size 8 "
+        "--learning-starts 40 --chunk-steps 80 --max-steps 15 --hidden 16 --select-every 0"
+    )
+    ends = ["--eval-episodes", "2", "--wandb"]
+    first = ["train", *options.split(), "--total-steps", "160", "--out", str(folder), *ends]
+    assert main(first) == 0
+    assert main(["train", "--resume", str(folder), "--total-steps", "240", *ends]) == 0
+    logs = sorted((folder / "wandb").glob("offline-run-*/run-*.wandb"))
+    rows = [each for log in logs for each in read_log(log)["rows"]]
+    assert [each["env_steps"] for each in rows if "loss" in each] == [80, 160, 240]
+    assert len({log.name for log in logs}) == 1
+    (video, _) = (each["policy"] for each in rows if "policy" in each)
+    assert video["_type"] == "video-file"
+
+
 def test_nothing_is_logged_before_the_first_chunk(tmp_path):
     with WandbLog(tmp_path):
         pass

@@ -232,6 +232,21 @@ def test_it_listens_on_this_machine_alone(viewer):
             socket.create_connection((other, viewer.server.get_port()), timeout=5)
 
 
+@pytest.mark.slow
+def test_a_scene_is_shown_without_an_agent():
+    viewer = Viewer(ViewOptions(subject=pathlib.Path("arm_push"), port=free_port()))
+    try:
+        for _ in range(3):
+            time.sleep(viewer.advance())
+        session = viewer.session
+        assert session.simulation.env.config.task == "push"
+        assert (session.actor, session.seen.q.shape) == ("nobody", (0,))
+        assert session.step_count >= 1
+        assert session.objects
+    finally:
+        viewer.close()
+
+
 @pytest.mark.parametrize(
     ("host", "expected"),
     [("127.0.0.1", True), ("localhost", True), ("::1", True), ("0.0.0.0", False), ("a.b", False)],
