@@ -96,7 +96,8 @@ DOCS := .venv-docs
 SITE := docs/_build/html
 
 docs: $(DOCS)/.locked
-	$(DOCS)/bin/python -m sphinx --quiet --fail-on-warning --keep-going docs $(SITE)
+	$(DOCS)/bin/python -m sphinx --quiet --fail-on-warning --keep-going \
+	  --doctree-dir docs/_build/doctrees docs $(SITE)
 	$(DOCS)/bin/python docs/check_site.py $(SITE)
 	@echo "open $(SITE)/index.html"
 

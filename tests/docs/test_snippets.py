@@ -14,6 +14,7 @@ import shutil
 import subprocess
 import sys
 import tomllib
+import types
 
 import pytest
 from doc_pages import ROOT, Snippet, all_snippets, commands, split_environment
@@ -68,18 +69,24 @@ def _python_pages() -> list[object]:
     found = []
     key = lambda each: (each.page, each.mark)  # noqa: E731
     for (page, mark), group in itertools.groupby(sorted(all_snippets("python"), key=key), key):
+        # The README has no room for a comment, and its snippet compiles for half a minute.
+        mark = "slow" if page == "README.md" else mark
         marks = [getattr(pytest.mark, mark)] if mark else []
         found.append(pytest.param(list(group), id=page, marks=marks))
     return found
 
 
 @pytest.mark.parametrize("group", _python_pages())
-def test_python_snippets_run(group: list[Snippet], folder: pathlib.Path):
-    names: dict[str, object] = {"__name__": "snippet"}
+def test_python_snippets_run(
+    group: list[Snippet], folder: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+):
+    module = types.ModuleType("snippet")
+    monkeypatch.setitem(sys.modules, "snippet", module)
     for each in group:
         # As many lines before it as in the page, for the traceback.
         code = "\n" * (each.line - 1) + each.text
-        exec(compile(code, str(ROOT / each.page), "exec"), names)
+        path = str(ROOT / each.page)
+        exec(compile(code, path, "exec", dont_inherit=True), module.__dict__)
 
 
 @pytest.mark.parametrize("snippet", _SHELL, ids=_name)
