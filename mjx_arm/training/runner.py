@@ -70,7 +70,7 @@ from mjx_arm.training.loop import (
 from mjx_arm.training.memory import check_memory, memory_plan, working_memory
 from mjx_arm.training.mesh import fetch, make_mesh, most_devices, place, shards_seeds
 from mjx_arm.training.objects import Objects, check_record, record
-from mjx_arm.training.processes import any_says, is_writer, on_writer
+from mjx_arm.training.processes import any_says, is_writer, on_writer, wait_for_all
 from mjx_arm.training.run_folder import (
     EVALUATION,
     SavedRun,
@@ -178,7 +178,8 @@ def train(
         loop = _Loop(trainer, run, run_chunk, folder, console, stop_at, on_chunk)
         console.print(f"training: {config.total_steps:,} environment steps")
         loop.run(state, 0)
-        return _finish_on_writer(folder, run, objects, eval_episodes, console)
+        local = _local_devices(trainer)
+        return _finish_on_writer(folder, run, objects, eval_episodes, console, local)
 
 
 def resume(
@@ -252,7 +253,8 @@ def resume(
         console.print(f"resuming after {done:,} steps")
         loop = _Loop(trainer, run, run_chunk, folder, console, stop_at, on_chunk)
         loop.run(state, vector_step // config.chunk_length)
-        return _finish_on_writer(folder, run, objects, eval_episodes, console)
+        local = _local_devices(trainer)
+        return _finish_on_writer(folder, run, objects, eval_episodes, console, local)
 
 
 def _own_console(console: Console | None) -> Console:
@@ -416,6 +418,8 @@ def _compile(trainer: Trainer, console: Console) -> RunChunk:
     plan = memory_plan(shapes) | {"working": working}
     say_working_memory(console, plan)
     check_memory(plan, _local_devices(trainer))
+    # The first chunk waits for the other processes too, but not as patiently.
+    wait_for_all()
     return compiled
 
 
@@ -640,13 +644,19 @@ class _Interruption:
 
 
 def _finish_on_writer(
-    folder: pathlib.Path, run: SavedRun, objects: Objects, eval_episodes: int, console: Console
+    folder: pathlib.Path,
+    run: SavedRun,
+    objects: Objects,
+    eval_episodes: int,
+    console: Console,
+    devices: int,
 ) -> list[Evaluation]:
     """What `_finish` returns, in every process."""
     results: list[Evaluation] = []
 
     def finish() -> str:
-        results.extend(_finish(folder, run, objects, eval_episodes, console))
+        mesh = make_mesh(devices, of_all=False)
+        results.extend(_finish(folder, run, objects, eval_episodes, console, mesh))
         return json.dumps([dataclasses.asdict(result) for result in results])
 
     said = on_writer(finish)
@@ -661,16 +671,21 @@ def _finish(
     objects: Objects,
     eval_episodes: int,
     console: Console,
+    mesh: jax.sharding.Mesh | None,
 ) -> list[Evaluation]:
     folders = seed_folders(folder, run.config)
     if len(folders) > 1:
         for path in plot_curves(folders, into=folder):
             console.print(f"curves: {path}", soft_wrap=True)
-    return [_finish_seed(own, objects, eval_episodes, console) for own in folders]
+    return [_finish_seed(own, objects, eval_episodes, console, mesh) for own in folders]
 
 
 def _finish_seed(
-    folder: pathlib.Path, objects: Objects, eval_episodes: int, console: Console
+    folder: pathlib.Path,
+    objects: Objects,
+    eval_episodes: int,
+    console: Console,
+    mesh: jax.sharding.Mesh | None,
 ) -> Evaluation:
     for path in plot_curves([folder], into=folder):
         console.print(f"curves: {path}", soft_wrap=True)
@@ -686,6 +701,7 @@ def _finish_seed(
         episodes=eval_episodes,
         epsilon=_EVALUATION_EPSILON,
         key=key,
+        mesh=mesh,
     )
     (folder / EVALUATION).write_text(json.dumps(dataclasses.asdict(result)) + "\n")
     add_evaluation(find_agent(folder), dataclasses.asdict(result))
