@@ -38,12 +38,14 @@ from mjx_arm.tools.zoo import describe_zoo, read_shipped, read_zoo
 from mjx_arm.training.agent import Agent, differences, load_agent
 from mjx_arm.training.evaluate import evaluate
 from mjx_arm.training.loop import EVALUATION, role_key
+from mjx_arm.training.mesh import make_mesh
 from mjx_arm.training.processes import (
     alone,
     end_together,
     is_writer,
     join_processes,
     lost_sentence,
+    watch_others,
 )
 from mjx_arm.training.run_folder import (
     load_config,
@@ -107,6 +109,8 @@ class Train:
     def run(self, given: frozenset[str]) -> None:
         """Runs the command; `given` are the names of the options on the command line."""
         console = make_console()
+        check_device()
+        watch_others()
         if self.resume is not None:
             self._resume(self.resume, given, console)
             return
@@ -262,6 +266,7 @@ class Eval(_Try):
             episodes=self.episodes,
             epsilon=self.epsilon,
             key=self.key(),
+            mesh=make_mesh(jax.local_device_count()),
         )
         report = dataclasses.asdict(result)
         if self.json:

@@ -18,11 +18,12 @@ AXIS = "device"
 _DIVIDED = ("batch_size", "teacher_batch_size", "student_batch_size")
 
 
-def make_mesh(devices: int) -> Mesh | None:
-    """A mesh of one axis over some local devices of every process.
+def make_mesh(devices: int, *, of_all: bool = True) -> Mesh | None:
+    """A mesh of one axis over some local devices of every process, or of this one alone.
 
     Args:
       devices: number of devices of each process.
+      of_all: whether those of the other processes belong to it too.
 
     Returns:
       The mesh, or None where that is one device in all: the program without a mesh.
@@ -35,9 +36,10 @@ def make_mesh(devices: int) -> Mesh | None:
         raise ValueError(
             f"devices must be at most {here}, the number of local devices, got {devices}"
         )
+    processes = range(jax.process_count()) if of_all else [jax.process_index()]
     chosen = [
         device
-        for process in range(jax.process_count())
+        for process in processes
         for device in jax.local_devices(process_index=process)[:devices]
     ]
     if len(chosen) == 1:

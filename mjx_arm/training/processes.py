@@ -10,6 +10,7 @@ import importlib.util
 import itertools
 import os
 import sys
+import threading
 import time
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -18,8 +19,10 @@ import jax
 import numpy as np
 from jax.experimental import multihost_utils
 
-# A process that sends no sign of life for so long is lost, seconds.
-_HEARTBEAT = 30
+# The processes meet so often, and one that does not come for so long is lost, seconds.
+_PERIOD, _SILENCE = 5, 30
+# jax ends a process with a page of its own when another is silent for so long, seconds.
+_HEARTBEAT = 100
 # The others wait for so long until a process has started, and until it ends, seconds.
 _START, _END = 300, 30
 # Process 0 evaluates, renders and writes while the others wait, ms.
@@ -27,6 +30,7 @@ _PATIENCE = 24 * 60 * 60 * 1000
 # Bytes of a text that process 0 tells the others.
 _TEXT = 65_536
 _barriers = itertools.count()
+_ending = threading.Event()
 
 
 def join_processes(
@@ -169,6 +173,33 @@ def wait_for_all() -> None:
     multihost.get_barrier_sync_fn()(key=name, timeout_ms=_PATIENCE)
 
 
+def watch_others() -> None:
+    """Ends this process with one sentence where another one is lost, in a thread of its own.
+
+    A collective waits for a lost process for ever. When process 0 is lost, which hosts the meeting,
+    jax ends the others at once and in its own words.
+    """
+    if alone():
+        return
+    from orbax.checkpoint import multihost
+
+    meet = multihost.get_barrier_sync_fn()
+
+    def watch() -> None:
+        for number in itertools.count():
+            if _ending.wait(_PERIOD):
+                return
+            try:
+                meet(key=f"mjx_arm_alive_{number}", timeout_ms=1_000 * _SILENCE)
+            except Exception as error:
+                if _ending.is_set():
+                    return
+                os.write(2, f"error: {lost_sentence(error)}\n".encode())
+                os._exit(2)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
 def lost_sentence(error: Exception) -> str:
     """What to say of an error of jax that ends one of several processes."""
     reason = " ".join(str(error).split())[:120]
@@ -187,6 +218,8 @@ def end_together(status: int) -> None:
     if not jax.distributed.is_initialized():
         return
     if status in (0, 130):
+        wait_for_all()
+        _ending.set()
         jax.distributed.shutdown()
         return
     # At exit jax would wait for processes that may be lost. Process 0 hosts the meeting: the others

@@ -72,7 +72,7 @@ from mjx_arm.training.loop import (
 from mjx_arm.training.memory import check_memory, memory_plan, working_memory
 from mjx_arm.training.mesh import fetch, make_mesh, most_devices, place, shards_seeds
 from mjx_arm.training.objects import Objects, check_record, only_here, record
-from mjx_arm.training.processes import any_says, is_writer, on_writer
+from mjx_arm.training.processes import any_says, is_writer, on_writer, wait_for_all
 from mjx_arm.training.run_folder import (
     EVALUATION,
     SavedRun,
@@ -184,7 +184,8 @@ def train(
         loop = _Loop(trainer, run, run_chunk, folder, console, stop_at, on_chunk)
         console.print(f"training: {config.total_steps:,} environment steps")
         loop.run(state, 0)
-        return _finish_on_writer(folder, run, objects, eval_episodes, console, video=video)
+        ending = _Ending(eval_episodes, console, _local_devices(trainer), video)
+        return _finish_on_writer(folder, run, objects, ending)
 
 
 def resume(
@@ -258,7 +259,8 @@ def resume(
         console.print(f"resuming after {done:,} steps")
         loop = _Loop(trainer, run, run_chunk, folder, console, stop_at, on_chunk)
         loop.run(state, vector_step // config.chunk_length)
-        return _finish_on_writer(folder, run, objects, eval_episodes, console)
+        ending = _Ending(eval_episodes, console, _local_devices(trainer))
+        return _finish_on_writer(folder, run, objects, ending)
 
 
 def _own_console(console: Console | None) -> Console:
@@ -422,6 +424,8 @@ def _compile(trainer: Trainer, console: Console) -> RunChunk:
     plan = memory_plan(shapes) | {"working": working}
     say_working_memory(console, plan)
     check_memory(plan, _local_devices(trainer))
+    # The first chunk waits for the other processes too, but not as patiently.
+    wait_for_all()
     return compiled
 
 
@@ -664,20 +668,32 @@ def _say(sentence: str) -> None:
         os.write(2, f"{sentence}\n".encode(errors="replace"))
 
 
+@dataclasses.dataclass(frozen=True)
+class _Ending:
+    """What becomes of a run at its end.
+
+    Attributes:
+      eval_episodes: episodes of the evaluation.
+      console: where it prints.
+      devices: local devices that share the evaluation.
+      video: record an episode.
+    """
+
+    eval_episodes: int
+    console: Console
+    devices: int
+    video: bool = True
+
+
 def _finish_on_writer(
-    folder: pathlib.Path,
-    run: SavedRun,
-    objects: Objects,
-    eval_episodes: int,
-    console: Console,
-    *,
-    video: bool = True,
+    folder: pathlib.Path, run: SavedRun, objects: Objects, ending: _Ending
 ) -> list[Evaluation]:
     """What `_finish` returns, in every process."""
     results: list[Evaluation] = []
 
     def finish() -> str:
-        results.extend(_finish(folder, run, objects, eval_episodes, console, video=video))
+        mesh = make_mesh(ending.devices, of_all=False)
+        results.extend(_finish(folder, run, objects, ending, mesh))
         return json.dumps([dataclasses.asdict(result) for result in results])
 
     said = on_writer(finish)
@@ -690,30 +706,32 @@ def _finish(
     folder: pathlib.Path,
     run: SavedRun,
     objects: Objects,
-    eval_episodes: int,
-    console: Console,
-    *,
-    video: bool = True,
+    ending: _Ending,
+    mesh: jax.sharding.Mesh | None,
 ) -> list[Evaluation]:
     folders = seed_folders(folder, run.config)
     if len(folders) > 1:
         for path in plot_curves(folders, into=folder):
-            console.print(f"curves: {path}", soft_wrap=True)
-    results = [_finish_seed(own, objects, eval_episodes, console, video=video) for own in folders]
+            ending.console.print(f"curves: {path}", soft_wrap=True)
+    results = [_finish_seed(own, objects, ending, mesh) for own in folders]
     if len(folders) > 1:
         for own, config in zip(folders, seed_configs(run.config), strict=True):
             write_report(own, config, [own])
     report = write_report(folder, run.config, folders)
-    console.print(f"report: {report}", soft_wrap=True)
+    ending.console.print(f"report: {report}", soft_wrap=True)
     return results
 
 
 def _finish_seed(
-    folder: pathlib.Path, objects: Objects, eval_episodes: int, console: Console, *, video: bool
+    folder: pathlib.Path,
+    objects: Objects,
+    ending: _Ending,
+    mesh: jax.sharding.Mesh | None,
 ) -> Evaluation:
+    console = ending.console
     for path in plot_curves([folder], into=folder):
         console.print(f"curves: {path}", soft_wrap=True)
-    console.print(f"evaluating: {eval_episodes} episodes")
+    console.print(f"evaluating: {ending.eval_episodes} episodes")
     scene = None if objects.env is not None else STORED
     agent = load_agent(folder, scene=scene, **objects.given())
     console.print(f"agent: {find_agent(folder)}, after {agent.env_steps:,} steps", soft_wrap=True)
@@ -722,9 +740,10 @@ def _finish_seed(
         agent.env,
         agent.apply,
         agent.params,
-        episodes=eval_episodes,
+        episodes=ending.eval_episodes,
         epsilon=_EVALUATION_EPSILON,
         key=key,
+        mesh=mesh,
     )
     (folder / EVALUATION).write_text(json.dumps(dataclasses.asdict(result)) + "\n")
     add_evaluation(find_agent(folder), dataclasses.asdict(result))
@@ -733,7 +752,7 @@ def _finish_seed(
         f"evaluation: {result.successes} of {result.episodes} episodes succeeded, "
         f"{100 * result.rate:.1f} % (95 % interval {100 * low:.1f} to {100 * high:.1f})"
     )
-    if not video:
+    if not ending.video:
         return result
     console.print("rendering a video")
     episode = record_episode(
