@@ -21,7 +21,8 @@ STAMP := $(VENV)/.locked-$(LOCK)
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 SUPPORTED := import sys; sys.exit(sys.version_info[:2] not in {(3, 11), (3, 12), (3, 13)})
 
-.PHONY: help setup train play test test-slow peers test-peers format lock lock-peers clean
+.PHONY: help setup train play test test-slow test-campaign peers test-peers docs format lock lock-peers \
+  lock-docs clean
 
 help:
 	@echo "make setup      build $(VENV) from the lock; GPU=cuda12 or GPU=cuda13 for NVIDIA"
@@ -29,8 +30,10 @@ help:
 	@echo "make play       video.mp4 of a shipped agent; AGENT=..., ARGS=\"--env A --out other.mp4\""
 	@echo "make test       ruff, mypy and the default tests"
 	@echo "make test-slow  the tests marked slow"
+	@echo "make test-campaign  tries to break runs and files, two hours; ARGS=\"--parts kills\" for a part"
 	@echo "make peers      build $(PEERS) with what we are measured against"
 	@echo "make test-peers the tests of the adapters, with trainers of others"
+	@echo "make docs       build the documentation, with its notebooks, and check its links"
 	@echo "make format     let ruff rewrite the sources"
 	@echo "make lock       resolve the lock again; ARGS=--upgrade for the newest versions"
 	@echo "make clean      remove caches and built packages (not $(VENV), not runs/)"
@@ -66,6 +69,10 @@ test: $(STAMP)
 test-slow: $(STAMP)
 	$(BIN)/python -m pytest -m slow
 
+# Outside the repository nothing is written; ARGS="--table FILE" keeps the results.
+test-campaign: $(STAMP)
+	$(BIN)/python benchmarks/campaign.py $(ARGS)
+
 # What we are measured against has an environment of its own, on Linux with Python 3.11. Its torch
 # is the CPU build, which PyTorch has in a place of its own: name that in PIP_FIND_LINKS.
 PEERS := .venv-peers
@@ -84,6 +91,24 @@ $(PEERS)/.locked: requirements/peers.txt
 test-peers: $(PEERS)/.locked
 	$(PEERS)/bin/python -m pytest -m peers
 
+# The documentation is built in an environment of its own, with the versions of the CPU's lock.
+DOCS := .venv-docs
+SITE := docs/_build/html
+
+docs: $(DOCS)/.locked
+	$(DOCS)/bin/python -m sphinx --quiet --fail-on-warning --keep-going \
+	  --doctree-dir docs/_build/doctrees docs $(SITE)
+	$(DOCS)/bin/python docs/check_site.py $(SITE)
+	@echo "open $(SITE)/index.html"
+
+$(DOCS)/.locked: requirements/docs.txt
+	@$(PYTHON) -m venv --clear $(DOCS)
+	@$(DOCS)/bin/python -m pip install --quiet --disable-pip-version-check \
+	  --require-hashes --only-binary :all: -r $<
+	@$(DOCS)/bin/python -m pip install --quiet --disable-pip-version-check \
+	  --no-build-isolation --no-deps --editable .
+	@touch $@
+
 format: $(STAMP)
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
@@ -101,6 +126,12 @@ lock-peers: .venv-lock/bin/uv-$(UV_VERSION)
 	  --constraints .venv-lock/constraints.txt --extra peers $(ARGS) --output-file requirements/peers.txt
 	@sed -i 's/^torch==\([0-9.]*\)+cpu/torch==\1/' requirements/peers.txt
 
+# The same versions as in the CPU's lock, so that the notebooks run what the tests run.
+lock-docs: .venv-lock/bin/uv-$(UV_VERSION)
+	@UV_CUSTOM_COMPILE_COMMAND="make lock-docs" .venv-lock/bin/uv pip compile pyproject.toml \
+	  --no-config --quiet --universal --python-version 3.11 --generate-hashes --no-emit-index-url \
+	  --constraints requirements/cpu.txt --extra docs $(ARGS) --output-file requirements/docs.txt
+
 # One file serves Python 3.11 to 3.13, Linux and macOS: markers choose among the versions.
 compile = UV_CUSTOM_COMPILE_COMMAND="make lock" .venv-lock/bin/uv pip compile pyproject.toml \
   --no-config --quiet --universal --python-version 3.11 --generate-hashes --no-emit-index-url \
@@ -112,5 +143,5 @@ compile = UV_CUSTOM_COMPILE_COMMAND="make lock" .venv-lock/bin/uv pip compile py
 	@touch $@
 
 clean:
-	rm -rf build dist .mypy_cache .pytest_cache .ruff_cache .venv-lock
+	rm -rf build dist docs/_build .mypy_cache .pytest_cache .ruff_cache .venv-lock
 	find mjx_arm tests benchmarks -name __pycache__ -type d -prune -exec rm -rf {} + 2>/dev/null || true

@@ -69,9 +69,9 @@ def stages(body: Body) -> dict[str, tuple[Callable[[Any], Any], Any]]:
     obs, next_obs = frames.decode(batch.frame), frames.decode(batch.next_frame)
 
     def render(envs: Any) -> Any:
-        drawn = jax.vmap(env.env.observe)(envs.env)
-        # Depends on the picture, or nothing would be drawn.
-        shift = 1e-9 * jnp.sum(drawn & 1, axis=(1, 2)).astype(jnp.float32)
+        image = jax.vmap(env.env.observe)(envs.env)
+        # Depends on the image, or XLA would leave the rendering out.
+        shift = 1e-9 * jnp.sum(image & 1, axis=(1, 2)).astype(jnp.float32)
         physics = envs.env.physics
         poses = physics.poses.replace(geom_xpos=physics.poses.geom_xpos + shift[:, None, None])
         return envs.replace(env=envs.env.replace(physics=physics.replace(poses=poses)))
@@ -91,8 +91,8 @@ def stages(body: Body) -> dict[str, tuple[Callable[[Any], Any], Any]]:
         return params, next_obs, obs
 
     def render_batch(frame: Any) -> Any:
-        drawn = frames.decode(frame)
-        shift = 1e-9 * jnp.sum(drawn & 1, axis=(1, 2)).astype(jnp.float32)[:, None]
+        image = frames.decode(frame)
+        shift = 1e-9 * jnp.sum(image & 1, axis=(1, 2)).astype(jnp.float32)[:, None]
         return frame | {"qpos": frame["qpos"] + shift}
 
     def update(carry: Any) -> Any:

@@ -4,7 +4,7 @@
     python benchmarks/throughput.py --gpu --json benchmarks/results/gpu.json
 
 Stages: `physics`, `render`, `physics+render`, `act` (the network on one observation of every
-environment), `learn` (one update: sampling, drawing and the gradient step) and `train` (the whole
+environment), `learn` (one update: sampling, rendering and the gradient step) and `train` (the whole
 loop). Each figure is the median of repeated chunks after a warm-up, and with `--rounds` of those
 medians, with the least and the most of all chunks beside it; memory is that of a run, at its peak,
 beside the plan that it prints. With `--json` rows are written as they come, and a log-log plot next
@@ -34,7 +34,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from machine import machine
-from matplotlib.figure import Figure
 
 import mjx_arm
 from mjx_arm.config import set_train_options
@@ -195,11 +194,11 @@ def env_stages(env: mjx_arm.Env, num_envs: int, length: int) -> dict[str, Callab
 
     def render(carry: Any) -> Any:
         def once(state: Any, shift: jax.Array) -> tuple[Any, jax.Array]:
-            # The poses depend on the step, or the image would be drawn once for all of them.
+            # The poses depend on the step, or one image would be rendered for all of them.
             physics = state.env.physics
             poses = physics.poses.replace(geom_xpos=physics.poses.geom_xpos + shift)
             moved = state.replace(env=state.env.replace(physics=physics.replace(poses=poses)))
-            # All pixels count, or a GPU would draw those alone that do.
+            # All pixels count, or a GPU would render only those that do.
             return state, jnp.sum(draw(env, moved) & 1, axis=(1, 2))
 
         return jax.lax.scan(once, carry[0], 1e-6 * jnp.arange(length, dtype=jnp.float32))
@@ -280,7 +279,7 @@ def env_rows(
     state = jax.jit(jax.vmap(mjx_arm.AutoReset(env).reset), compiler_options=flags)(
         jax.random.split(jax.random.key(0), num_envs)
     )[1]
-    # The images from outside, or the first would be drawn in the chunk on top of its steps.
+    # The images from outside, or the chunk would render the first one in addition to its steps.
     carry = state, jax.jit(functools.partial(draw, env))(state)
     for stage, run in env_stages(env, num_envs, length).items():
         if stage in options.stages and not (shadows and stage == "physics"):
@@ -388,6 +387,9 @@ def memory(row: dict[str, Any]) -> str:
 
 def plot(rows: list[dict[str, Any]], path: pathlib.Path) -> None:
     """Log-log plot of the figures of 64 by 64 pixels without shadows."""
+    # Not on a machine that has only what training itself needs.
+    from matplotlib.figure import Figure
+
     figure = Figure(figsize=(7, 4.5), layout="constrained")
     axes = figure.subplots()
     chosen = [row for row in rows if row["size"] == 64 and not row["shadows"]]

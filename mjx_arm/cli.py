@@ -38,6 +38,15 @@ from mjx_arm.tools.zoo import describe_zoo, read_shipped, read_zoo
 from mjx_arm.training.agent import Agent, differences, load_agent
 from mjx_arm.training.evaluate import evaluate
 from mjx_arm.training.loop import EVALUATION, role_key
+from mjx_arm.training.mesh import make_mesh
+from mjx_arm.training.processes import (
+    alone,
+    end_together,
+    is_writer,
+    join_processes,
+    lost_sentence,
+    watch_others,
+)
 from mjx_arm.training.run_folder import (
     load_config,
     new_run_folder,
@@ -49,7 +58,10 @@ from mjx_arm.training.runner import RunInterruptedError, resume, stop_signals, t
 from mjx_arm.view.viewer import ViewOptions, view
 
 # Options that may change when a run is resumed.
-_CHANGEABLE = frozenset({"resume", "total_steps", "eval_episodes", "stop_at", "wandb"})
+_PROCESSES = ("coordinator", "num_processes", "process_id")
+_CHANGEABLE = frozenset(
+    {"resume", "total_steps", "eval_episodes", "stop_at", "wandb", "devices", *_PROCESSES}
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -66,13 +78,18 @@ class Train:
         of a run.
       options: options of the run.
       out: folder for everything the run leaves; by default `runs/` and the time.
-      resume: folder of a run to continue; only `--total-steps`, `--eval-episodes` and `--stop-at`
-        may then be given.
+      resume: folder of a run to continue; only `--total-steps`, `--eval-episodes`, `--stop-at` and
+        the number of devices and processes may then be given.
       init_from: an agent or a run folder whose network the run starts from.
       stop_at: end the run when an evaluation that selects has reached this success rate.
       eval_episodes: episodes of the evaluation at the end, by the best agent, at epsilon 0.1 and on
         starts and random numbers that neither training nor the selection has seen.
       wandb: also log the run to Weights & Biases; `WANDB_MODE=offline` keeps it in the run folder.
+      devices: number of local devices that share the work; by default as many as divide it.
+      coordinator: `HOST:PORT` of process 0, where several processes train one run; each gets the
+        same command but for its number. Slurm, Open MPI and Kubernetes say all three themselves.
+      num_processes: number of processes of the run.
+      process_id: number of this process, from 0.
     """
 
     options: Annotated[TrainConfig, tyro.conf.arg(name="")]
@@ -84,17 +101,25 @@ class Train:
     stop_at: float | None = None
     eval_episodes: int = 200
     wandb: bool = False
+    devices: int | None = None
+    coordinator: str | None = None
+    num_processes: int | None = None
+    process_id: int | None = None
 
     def run(self, given: frozenset[str]) -> None:
         """Runs the command; `given` are the names of the options on the command line."""
         console = make_console()
+        check_device()
+        watch_others()
         if self.resume is not None:
             self._resume(self.resume, given, console)
             return
-        if self.config is None:
+        if self.config is None and is_writer():
             console.print(f"preset: {self.preset}")
         out = self.out
         if self.wandb and out is None:
+            if not alone():
+                raise ValueError("--wandb with several processes needs --out FOLDER")
             import_wandb()
             out = new_run_folder(self.options.env.env)
         with self._log(out) as on_chunk:
@@ -105,13 +130,14 @@ class Train:
                 stop_at=self.stop_at,
                 init_from=self.init_from,
                 on_chunk=on_chunk,
+                devices=self.devices,
                 console=console,
             )
 
     def _log(
         self, folder: pathlib.Path | None
     ) -> contextlib.AbstractContextManager[WandbLog | None]:
-        if not self.wandb or folder is None:
+        if not self.wandb or folder is None or not is_writer():
             return contextlib.nullcontext()
         return WandbLog(folder)
 
@@ -132,6 +158,7 @@ class Train:
                 eval_episodes=self.eval_episodes,
                 stop_at=self.stop_at,
                 on_chunk=on_chunk,
+                devices=self.devices,
                 console=console,
             )
 
@@ -239,6 +266,7 @@ class Eval(_Try):
             episodes=self.episodes,
             epsilon=self.epsilon,
             key=self.key(),
+            mesh=make_mesh(jax.local_device_count()),
         )
         report = dataclasses.asdict(result)
         if self.json:
@@ -459,7 +487,20 @@ def _subject(kind: type[Command], name: str, command: str, given: Sequence[str])
     return {name: given[0] if kind is Agents else pathlib.Path(given[0])}
 
 
+def _join(arguments: Sequence[str]) -> None:
+    """Meets the other processes of the run, before anything asks jax for its devices."""
+    known = {name: x for name, x in _annotations(Train).items() if name in _PROCESSES}
+    first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    for name in known:
+        first.add_argument(f"--{name.replace('_', '-')}", nargs="?", const="")
+    texts = vars(first.parse_known_args(arguments)[0])
+    own = [f"--{name.replace('_', '-')}={text}" for name, text in texts.items() if text is not None]
+    join_processes(**read_arguments(own, known)[0])
+
+
 def _parse_train(kind: type[Trains], arguments: Sequence[str]) -> tuple[Trains, frozenset[str]]:
+    if kind is Train:
+        _join(arguments)
     start = _start(kind, arguments)
     own = {name: x for name, x in _annotations(kind).items() if name != "options"}
     values, others = read_arguments(arguments, own | flat_annotations(start.options))
@@ -522,13 +563,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"error: {where}{' '.join(str(error.strerror or error).split())}", file=sys.stderr)
         return 2
     except jax.errors.JaxRuntimeError as error:
-        if "RESOURCE_EXHAUSTED" not in str(error):
+        if "RESOURCE_EXHAUSTED" in str(error):
+            advice = "give a smaller --replay-size, --num-envs or batch size"
+            print(f"error: the device has run out of memory: {advice}", file=sys.stderr)
+        elif alone():
             raise
-        advice = "give a smaller --replay-size, --num-envs or batch size"
-        print(f"error: the device has run out of memory: {advice}", file=sys.stderr)
+        else:
+            print(f"error: {lost_sentence(error)}", file=sys.stderr)
         return 2
     except RunInterruptedError as stop:
-        print(stop, file=sys.stderr)
+        if is_writer():
+            print(stop, file=sys.stderr)
         return 130
     return 0
 
@@ -545,7 +590,9 @@ def run(arguments: Sequence[str] | None = None) -> NoReturn:
         # A terminal or a log that cannot show a character does not end a run.
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")
-    sys.exit(main(arguments))
+    status = main(arguments)
+    end_together(status)
+    sys.exit(status)
 
 
 def _stop(number: int, frame: FrameType | None) -> NoReturn:

@@ -20,6 +20,7 @@ from mjx_arm.options import (
     Positive,
     Share,
     check_name,
+    check_value,
     from_json,
     options,
     set_options,
@@ -175,10 +176,10 @@ class DistillConfig(AlgorithmConfig):
     teacher_hidden: Count = 512
     teacher_learning_rate: Positive = 3e-4
     teacher_polyak: Share = 0.005
-    student_starts: CountOrZero = 700_000
+    student_starts: CountOrZero = 1_200_000
     student_batch_size: Count = 64
     student_updates_per_step: Count = 3
-    student_learning_rate: Positive = 5e-4
+    student_learning_rate: Positive = 1e-3
     student_polyak: Share = 0.005
     student_share: Share = 0.5
     student_temperature: Positive = 0.5
@@ -313,9 +314,11 @@ def set_train_options(config: TrainConfig, values: Mapping[str, Any]) -> TrainCo
     """
     values = dict(values)
     task = values.pop("task", config.env.task)
+    check_value("task", str, task)
     if task != config.env.task:
         config = dataclasses.replace(config, env=set_env_options(config.env, {"task": task}))
     algorithm = values.pop("algorithm", config.algorithm)
+    check_value("algorithm", str, algorithm)
     if algorithm != config.algorithm:
         check_name("algorithm", algorithm, _ALGORITHMS)
         config = dataclasses.replace(config, algorithm=algorithm, algo=_ALGORITHMS[algorithm]())
@@ -330,6 +333,13 @@ def advice(config: TrainConfig) -> list[str]:
             f"a chunk has {config.chunk_length} steps of {config.num_envs} environments, so that "
             f"most of the time goes to the pauses between chunks: give --chunk-steps "
             f"{256 * config.num_envs}"
+        )
+    algo = config.algo
+    if isinstance(algo, DistillConfig) and config.total_steps <= algo.student_starts:
+        said.append(
+            f"the run ends after {config.total_steps:,} steps, and the agent that is saved learns "
+            f"from step {algo.student_starts:,} on: give a lower --student-starts, or more "
+            "--total-steps"
         )
     needed = max(config.env.max_steps // 4, 8 * config.algo.n_step)
     if config.replay_slots < needed:

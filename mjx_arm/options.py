@@ -186,6 +186,8 @@ def check_name(what: str, name: str, known: Iterable[str], *, prefix: str = "") 
     Raises:
       ValueError: `name` is not in `known`.
     """
+    if not isinstance(name, str):
+        raise ValueError(invalid(what, str, name))
     names = list(known)
     if name in names:
         return

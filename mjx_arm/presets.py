@@ -27,6 +27,10 @@ from __future__ import annotations
 
 from mjx_arm.config import TrainConfig, train_config
 
+# `fast` and `gpu` train in B from wider starts than B has: cubes that are knocked away come to lie
+# outside its rectangle (98 instead of 95 % of 100 episodes after 1.3 million steps).
+_WIDER = {"joint_noise_scale": 1.5, "rectangle_scale": 1.6}
+
 # `fast` is the default on a CPU; `pixels` has no teacher that sees the simulator's state; the agent
 # of `state` sees the state itself and no image; `smoke` shows in minutes that everything works;
 # `paper` has every value that James & Johns 2016 state, and where they state none (batch, target
@@ -34,6 +38,7 @@ from mjx_arm.config import TrainConfig, train_config
 PRESETS: dict[str, TrainConfig] = {
     "fast": train_config(
         algorithm="distill",
+        **_WIDER,
         max_steps=500,
         layer_norm=True,
         dense_layers=2,
@@ -84,6 +89,7 @@ PRESETS: dict[str, TrainConfig] = {
     ),
     "gpu": train_config(
         algorithm="distill",
+        **_WIDER,
         num_envs=4_096,
         layer_norm=True,
         dense_layers=2,
@@ -93,6 +99,7 @@ PRESETS: dict[str, TrainConfig] = {
         total_steps=40_000_000,
         select_every=2_097_152,
         select_episodes=200,
+        student_starts=8_000_000,
         teacher_batch_size=8_192,
         student_batch_size=2_048,
         student_updates_per_step=4,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import importlib
 import inspect
@@ -9,12 +10,12 @@ import pathlib
 import sys
 from typing import Any
 
-_LOCAL = ("<lambda>", "<locals>", "__main__")
+_LOCAL = ("<lambda>", "<locals>")
 
 
-def is_reference(text: str) -> bool:
-    """Whether a text has the form `module:name`."""
-    return ":" in text
+def is_reference(text: object) -> bool:
+    """Whether a value is a text of the form `module:name`."""
+    return isinstance(text, str) and ":" in text
 
 
 def reference_to(value: Any) -> str:
@@ -23,9 +24,19 @@ def reference_to(value: Any) -> str:
     return f"{named.__module__}:{named.__qualname__}"
 
 
-def is_importable(reference: str) -> bool:
-    """Whether another process can import what a reference names; a lambda it cannot."""
-    return not any(part in reference for part in _LOCAL)
+def has_lasting_source(value: Any) -> bool:
+    """Whether another process can have the same object: it has a name of its own in a file.
+
+    A lambda, a function inside a function and a `functools.partial` have none: what they enclose is
+    not in their source.
+    """
+    if isinstance(value, functools.partial) or any(part in reference_to(value) for part in _LOCAL):
+        return False
+    try:
+        source_digest(value)
+    except ValueError:
+        return False
+    return True
 
 
 def load_module(name: str, what: str) -> Any:

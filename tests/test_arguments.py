@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import re
+
 import pytest
 
 from mjx_arm.arguments import read_arguments
-from mjx_arm.cli import Train, _parse, main
+from mjx_arm.cli import Train, _annotations, _parse, main
+from mjx_arm.options import flat_names
 from mjx_arm.presets import PRESETS
 
 
@@ -59,7 +62,7 @@ def test_several_texts_make_a_tuple():
         (["train", "--double", "true"], "unexpected argument 'true': options start with --"),
         (["train", "--double=true"], "--double takes no value, got 'true'"),
         (["train", "--storage", "disk"], "--storage must be one of states, pixels, got 'disk'"),
-        (["train", "--joint-noise", "x"], "--joint-noise must be a finite number or None, got 'x'"),
+        (["train", "--joint-noise", "x"], "--joint-noise must be a finite number of at least 0"),
         (["train", "--stop-at", "nan"], "stop_at must be a finite number or None, got nan"),
         (["train", "--out"], "--out must be a path or None, got nothing"),
         (["train", "--eval-episodes", "1e3"], "--eval-episodes must be a whole number, got '1e3'"),
@@ -92,3 +95,14 @@ def test_help_is_help(command, capsys):
         main([*command, "--help"])
     assert ended.value.code == 0
     assert "usage: mjx-arm" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("preset", ["pixels", "fast"])
+def test_the_help_lists_the_options_that_the_command_line_takes(preset, capsys):
+    with pytest.raises(SystemExit):
+        main(["train", "--preset", preset, "--help"])
+    listed = set(re.findall(r"--[a-z][a-z0-9-]*", capsys.readouterr().out))
+    names = {*flat_names(PRESETS[preset]), *_annotations(Train)} - {"options"}
+    taken = {f"--{name.replace('_', '-')}" for name in names}
+    assert taken <= listed
+    assert {x for x in listed - taken if not x.startswith("--no-")} == {"--help"}

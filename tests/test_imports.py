@@ -89,7 +89,7 @@ def test_only_the_command_line_imports_the_tools():
 
 def test_every_part_of_the_package_is_in_the_table():
     outer = {"__init__", "__main__", "arguments", "cli", "presets"}
-    helpers = {"cores", "devices", "digest", "microbatch", "references", "silence"}
+    helpers = {"cores", "devices", "digest", "microbatch", "references", "shard", "silence"}
     names = {path.stem for path in PACKAGE.iterdir() if path.suffix == ".py" or path.is_dir()}
     found = {name for name in names if modules(name)}
     assert found - {"xml", "__pycache__"} == set(FORBIDDEN) | outer | helpers

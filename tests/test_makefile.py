@@ -70,6 +70,16 @@ def test_whole_environment_is_built_again_only_for_a_newer_lock(target: str, ven
     assert BUILDS in make("--dry-run", target, f"VENV={venv}").stdout
 
 
+def test_documentation_has_a_lock_of_its_own_and_is_checked(venv: Path) -> None:
+    assert f"{BUILDS} --only-binary :all: -r requirements/docs.txt" in (
+        make("--dry-run", "docs", f"DOCS={venv}").stdout
+    )
+    (venv / ".locked").touch()
+    output = make("--dry-run", "docs", f"DOCS={venv}").stdout
+    assert BUILDS not in output
+    assert output.index("--fail-on-warning") < output.index("docs/check_site.py")
+
+
 def test_gpu_environment_is_kept_by_all_but_setup(venv: Path) -> None:
     (venv / ".locked-cuda12").touch()
     assert BUILDS not in make("--dry-run", "train", f"VENV={venv}").stdout

@@ -5,11 +5,13 @@ import json
 import math
 from typing import Annotated, Literal
 
+import numpy as np
 import pytest
 from pydantic import Field
 
 from mjx_arm.config import (
     TrainConfig,
+    advice,
     dump_config,
     parse_config,
     set_train_options,
@@ -251,3 +253,30 @@ def test_every_option_of_every_class_is_described():
             if dataclasses.is_dataclass(group):
                 for name in option_names(type(group)):
                     assert f"      {name}: " in type(group).__doc__, (type(group), name)
+
+
+@pytest.mark.parametrize("name", ["task", "algorithm"])
+@pytest.mark.parametrize("value", [3.5, None, ["lift"], b"dqn", np.array(["lift", "push"])])
+def test_what_is_no_text_is_no_name(name, value):
+    with pytest.raises(ValueError, match=f"^{name} must be text, got "):
+        train_config(**{name: value})
+
+
+@pytest.mark.parametrize(
+    ("preset", "options", "sentence"),
+    [
+        ("fast", {}, None),
+        ("gpu", {}, None),
+        ("fast", {"total_steps": 1_200_000}, "the agent that is saved learns from step 1,200,000"),
+        ("pixels", {"num_envs": 8_192}, "a chunk has 1 steps of 8192 environments"),
+        ("pixels", {"replay_size": 3_200}, "the replay holds 50 steps of each environment"),
+        ("pixels", {"num_envs": 512, "chunk_steps": 2**20}, "training samples 0.12 transitions"),
+    ],
+)
+def test_valid_options_that_make_no_sense_get_a_sentence(preset, options, sentence):
+    said = advice(set_train_options(PRESETS[preset], options))
+    assert all("\n" not in x for x in said)
+    if sentence is None:
+        assert said == []
+    else:
+        assert any(x.startswith(sentence) or sentence in x for x in said)

@@ -10,6 +10,8 @@ import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
+import mjx_arm
+
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 EXTRAS = PROJECT["project"]["optional-dependencies"]
@@ -48,7 +50,7 @@ def versions(lock: str, python: str, platform: dict[str, str]) -> dict[str, str]
     return found
 
 
-@pytest.mark.parametrize("lock", [*LOCKS, "peers"])
+@pytest.mark.parametrize("lock", [*LOCKS, "docs", "peers"])
 def test_lock_pins_and_hashes_everything(lock: str) -> None:
     locked = pins(lock)
     assert locked
@@ -60,7 +62,7 @@ def test_lock_pins_and_hashes_everything(lock: str) -> None:
         assert all(re.fullmatch(r"sha256:[0-9a-f]{64}", each) for each in hashes), requirement
 
 
-@pytest.mark.parametrize("lock", [*LOCKS, "peers"])
+@pytest.mark.parametrize("lock", [*LOCKS, "docs", "peers"])
 def test_lock_names_no_place(lock: str) -> None:
     """No index, host or path: the lock means the same on every machine."""
     text = (ROOT / "requirements" / f"{lock}.txt").read_text()
@@ -97,6 +99,15 @@ def test_gpu_lock_adds_to_the_cpu_lock(lock: str, python: str) -> None:
     assert gpu[f"jax-{lock}-plugin"] == gpu["jaxlib"]
 
 
+def test_documentation_runs_what_the_tests_run() -> None:
+    """The lock of the documentation has the versions of the CPU's lock."""
+    cpu, docs = versions("cpu", "3.11", LINUX), versions("docs", "3.11", LINUX)
+    for requirement in map(Requirement, [*PROJECT["project"]["dependencies"], *EXTRAS["docs"]]):
+        version = docs[canonicalize_name(requirement.name)]
+        assert requirement.specifier.contains(version), f"{requirement}, but {version} is locked"
+    assert {name: docs[name] for name in cpu.keys() & docs.keys()}.items() <= cpu.items()
+
+
 def test_warp_is_the_version_mjx_asks_for() -> None:
     asked = [Requirement(each) for each in metadata.requires("mujoco-mjx") or []]
     (wanted,) = [each.specifier for each in asked if each.name == "warp-lang"]
@@ -107,4 +118,4 @@ def test_warp_is_the_version_mjx_asks_for() -> None:
 def test_changelog_has_the_version() -> None:
     headings = re.findall(r"^## (\S+)", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
     assert headings[0] == "Unreleased"
-    assert headings[1] == PROJECT["project"]["version"]
+    assert headings[1] == mjx_arm.__version__

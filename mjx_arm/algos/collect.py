@@ -15,6 +15,7 @@ import jax.numpy as jnp
 from mjx_arm.algos.exploration import epsilon_greedy
 from mjx_arm.envs.auto_reset import AutoReset, AutoResetState
 from mjx_arm.envs.state import Transition
+from mjx_arm.shard import WHOLE, Shard
 
 Counts = dict[str, jax.Array]
 
@@ -58,6 +59,7 @@ def act(
     envs: AutoResetState,
     q: jax.Array,
     epsilon: jax.Array,
+    shard: Shard = WHOLE,
 ) -> tuple[jax.Array, AutoResetState, Transition]:
     """Acts epsilon-greedily in all environments. Consumes the key.
 
@@ -67,13 +69,14 @@ def act(
       envs: `[N]` environments.
       q: `[N, A] float32`, Q-values of what they show.
       epsilon: `[]` or `[N] float32`, share of random actions.
+      shard: where `envs` are those of one shard and `key` is that of all shards together.
 
     Returns:
       The actions `[N] int32`, the environments after, and the transitions.
     """
     act_key, env_key = jax.random.split(key)
-    action = epsilon_greedy(act_key, q, epsilon)
-    keys = jax.random.split(env_key, len(q))
+    action = epsilon_greedy(act_key, q, epsilon, shard)
+    keys = shard.own(jax.random.split(env_key, len(q) * shard.count))
     envs, transition = jax.vmap(auto.transition)(keys, envs, action)
     return action, envs, transition
 

@@ -21,6 +21,7 @@ from mjx_arm.algos.dqn import Learner, QLearning, first_update, num_microbatches
 from mjx_arm.algos.frames import Frame, Frames, Obs
 from mjx_arm.algos.replay import Replay, sample, sample_frames
 from mjx_arm.config import DistillConfig
+from mjx_arm.shard import Shard
 
 Params = Any
 
@@ -102,6 +103,11 @@ class Distill:
         return params
 
     @property
+    def shard(self) -> Shard:
+        """The part of each batch that `learn` samples."""
+        return self.teacher.shard
+
+    @property
     def _optimizer(self) -> optax.GradientTransformation:
         return optax.adam(self.config.student_learning_rate)
 
@@ -118,7 +124,7 @@ class Distill:
         def mixed() -> jax.Array:
             of_student = self.apply(pair.student.averaged, obs)
             # Evenly among the environments, whose shares of random actions rise.
-            index = jnp.arange(self.num_envs)
+            index = self.shard.own(jnp.arange(self.num_envs))
             mask = (index + 1) * driven // self.num_envs > index * driven // self.num_envs
             return jnp.where(mask[:, None], of_student, of_teacher)
 
@@ -143,12 +149,12 @@ class Distill:
         self, key: jax.Array, pair: Pair, replay: Replay, env_steps: jax.Array
     ) -> tuple[Pair, dict[str, jax.Array]]:
         """One update of the teacher and several of the student, each from its start on."""
-        config = self.config
+        config, shard = self.config, self.shard
         teacher_key, student_key = jax.random.split(key)
 
         def teach(learner: Learner, key: jax.Array) -> tuple[Learner, dict[str, jax.Array]]:
-            size = config.teacher_batch_size
-            batch = sample(replay, key, size, config.n_step, config.gamma)
+            size = shard.part(config.teacher_batch_size)
+            batch = sample(replay, shard.fold(key), size, config.n_step, config.gamma)
             features = self.frames.features
             return self.teacher.update(
                 learner, batch, features(batch.frame), features(batch.next_frame)
@@ -158,7 +164,8 @@ class Distill:
         teacher, taught = update_when(ready, teach, teacher_key, pair.teacher, 1, _TEACHER_METRICS)
 
         def imitate(student: Student, key: jax.Array) -> tuple[Student, dict[str, jax.Array]]:
-            frame = sample_frames(replay, key, config.student_batch_size)
+            size = shard.part(config.student_batch_size)
+            frame = sample_frames(replay, shard.fold(key), size)
             target = self.teacher.apply(teacher.target_params, self.frames.features(frame))
             return self.imitate(student, self.frames.decode(frame), target)
 
@@ -179,7 +186,7 @@ class Distill:
 
         Args:
           student: before.
-          obs: `[B, ...]`.
+          obs: `[B, ...]`, the part of a shard; the gradients are those of the whole batch.
           target: `[B, A] float32`, the teacher's Q-values.
 
         Returns:
@@ -187,7 +194,7 @@ class Distill:
           action.
         """
         advantage = target - jnp.mean(target, axis=-1, keepdims=True)
-        power = jnp.mean(jnp.square(advantage))
+        power = self.shard.mean(jnp.mean(jnp.square(advantage)))
         rate = 1.0 / _SPREAD_UPDATES
         spread = (1 - rate) * student.spread + rate * jnp.sqrt(power + 1e-10)
         parts = num_microbatches(len(target))
@@ -206,14 +213,14 @@ class Distill:
 
         zeros = jax.tree.map(jnp.zeros_like, student.params)
         grads, (losses, agreements) = jax.lax.scan(add, zeros, rows)
-        grads = jax.tree.map(lambda x: x / parts, grads)
+        grads = self.shard.mean(jax.tree.map(lambda x: x / parts, grads))
         # Adam's bias correction raises a float to an integer power; strict promotion is for ours.
         with jax.numpy_dtype_promotion("standard"):
             changes, opt_state = self._optimizer.update(grads, student.opt_state, student.params)
         params = optax.apply_updates(student.params, changes)
         averaged = optax.incremental_update(params, student.averaged, self.config.student_polyak)
         metrics = {"student_loss": jnp.mean(losses), "student_agreement": jnp.mean(agreements)}
-        return Student(params, opt_state, averaged, spread), metrics
+        return Student(params, opt_state, averaged, spread), self.shard.mean(metrics)
 
 
 def imitation_loss(q: jax.Array, target: jax.Array, temperature: jax.Array) -> jax.Array:

@@ -16,6 +16,7 @@ from mjx_arm.algos.frames import Frame, Frames, Obs
 from mjx_arm.algos.replay import Batch, Replay, sample
 from mjx_arm.config import DQNConfig
 from mjx_arm.microbatch import microbatched
+from mjx_arm.shard import WHOLE, Shard
 
 Params = Any
 
@@ -51,6 +52,7 @@ class QLearning:
       target_period: updates between copies to the target network, where `polyak` is 0.
       microbatches: number of equal parts of a batch; their gradients are added. What a part needs
         in between may fit a cache where that of the whole batch does not.
+      shard: the part of a batch that `update` gets; the gradients are those of the whole batch.
     """
 
     apply: Callable[[Params, jax.Array], jax.Array]
@@ -61,6 +63,7 @@ class QLearning:
     polyak: float
     target_period: int
     microbatches: int = 1
+    shard: Shard = WHOLE
 
     def policy(self, learner: Learner) -> Params:
         """Parameters to judge and to keep.
@@ -95,7 +98,8 @@ class QLearning:
         Returns:
           The learner after, and `loss`, `q_mean` and `target_max`, each `[] float32`.
         """
-        total = jnp.maximum(jnp.sum(batch.weight), 1.0)
+        # The mean over the shards of the sums below is the weighted mean over the whole batch.
+        total = jnp.maximum(self.shard.mean(jnp.sum(batch.weight)), 1.0 / self.shard.count)
         # Zeros where a transition is masked: its frame may hold NaN, and 0 times NaN is NaN.
         obs, next_obs = (_zero_where_masked(x, batch.weight) for x in (obs, next_obs))
         rows = (batch.action, batch.reward, batch.discount, batch.weight / total, obs, next_obs)
@@ -113,6 +117,9 @@ class QLearning:
                 "q_mean": jnp.mean(each["q_mean"]),
                 "target_max": jnp.max(each["target_max"]),
             }
+        grads = self.shard.mean(grads)
+        largest = self.shard.largest(metrics["target_max"])
+        metrics = self.shard.mean(metrics) | {"target_max": largest}
         # Adam's bias correction raises a float to an integer power; strict promotion is for ours.
         with jax.numpy_dtype_promotion("standard"):
             changes, opt_state = self.optimizer.update(grads, learner.opt_state, learner.params)
@@ -190,7 +197,9 @@ def _zero_where_masked(obs: Any, weight: jax.Array) -> Any:
     return jax.tree.map(zero, obs)
 
 
-def make_q_learning(config: DQNConfig, network: Any, *, pixels: bool) -> QLearning:
+def make_q_learning(
+    config: DQNConfig, network: Any, *, pixels: bool, shard: Shard = WHOLE
+) -> QLearning:
     """Q-learning of a Flax module, with the options of `DQNConfig`."""
     return QLearning(
         apply=lambda params, obs: microbatched(lambda rows: network.apply(params, rows))(obs),
@@ -200,7 +209,8 @@ def make_q_learning(config: DQNConfig, network: Any, *, pixels: bool) -> QLearni
         huber=config.huber,
         polyak=config.polyak,
         target_period=config.target_period,
-        microbatches=num_microbatches(config.batch_size) if pixels else 1,
+        microbatches=num_microbatches(shard.part(config.batch_size)) if pixels else 1,
+        shard=shard,
     )
 
 
@@ -278,10 +288,11 @@ class DQN:
     ) -> tuple[Learner, dict[str, jax.Array]]:
         """The updates of one step; none while the replay holds too little."""
         del env_steps
-        config = self.config
+        config, shard = self.config, self.q_learning.shard
 
         def update(learner: Learner, key: jax.Array) -> tuple[Learner, dict[str, jax.Array]]:
-            batch = sample(replay, key, config.batch_size, config.n_step, config.gamma)
+            size = shard.part(config.batch_size)
+            batch = sample(replay, shard.fold(key), size, config.n_step, config.gamma)
             obs = self.frames.decode(batch.frame)
             next_obs = self.frames.decode(batch.next_frame)
             return self.q_learning.update(learner, batch, obs, next_obs)

@@ -9,6 +9,7 @@ import optax
 
 from mjx_arm.config import ExplorationConfig
 from mjx_arm.options import Share, check_value
+from mjx_arm.shard import WHOLE, Shard
 
 
 def epsilon_at(config: ExplorationConfig, env_steps: jax.Array) -> jax.Array:
@@ -38,13 +39,17 @@ def check_epsilon(epsilon: float) -> None:
     check_value("epsilon", Share, epsilon)
 
 
-def epsilon_greedy(key: jax.Array, q: jax.Array, epsilon: jax.Array) -> jax.Array:
+def epsilon_greedy(
+    key: jax.Array, q: jax.Array, epsilon: jax.Array, shard: Shard = WHOLE
+) -> jax.Array:
     """Actions for Q-values `[N, A] float32`, `[N] int32`; consumes the key.
 
-    Each is uniformly random with probability `epsilon`, `[] or [N] float32`, else the best.
+    Each is uniformly random with probability `epsilon`, `[] or [N] float32`, else the best. With a
+    shard `N` is the number of its own rows, and the key is that of all shards together: so the
+    random numbers of a row do not depend on the number of shards.
     """
     explore_key, action_key = jax.random.split(key)
-    num_envs, num_actions = q.shape
-    explore = jax.random.uniform(explore_key, (num_envs,)) < epsilon
-    random = jax.random.randint(action_key, (num_envs,), 0, num_actions)
+    rows, num_actions = q.shape[0] * shard.count, q.shape[1]
+    explore = shard.own(jax.random.uniform(explore_key, (rows,))) < epsilon
+    random = shard.own(jax.random.randint(action_key, (rows,), 0, num_actions))
     return jnp.where(explore, random, jnp.argmax(q, axis=-1).astype(jnp.int32))

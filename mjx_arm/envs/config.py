@@ -6,13 +6,23 @@ import dataclasses
 from typing import Any, Literal
 
 from mjx_arm.envs.tasks import TaskConfig, find_task
-from mjx_arm.options import Count, Positive, Size, flat_names, options, set_options
+from mjx_arm.options import (
+    Count,
+    NotNegative,
+    Positive,
+    Size,
+    check_value,
+    flat_names,
+    options,
+    set_options,
+)
 
 Physics = Literal["auto", "native", "mjx", "mjx-warp"]
 ObservationKind = Literal["rgb", "rgbd", "segmentation", "state", "packed"]
 
 # What sets the paper's two environments apart (section 4.2).
 _JOINT_NOISE = {"A": 0.0, "B": 20.0}
+_MOST_NOISE = 45.0
 _PLACEMENT = {"A": "fixed", "B": "after_success"}
 
 
@@ -34,6 +44,8 @@ class EnvConfig:
       reward_scale: factor on every term of the reward.
       joint_noise: each joint starts uniformly within this of home, degrees; None for 0 in A and
         20 in B. Slides start within that many millimetres.
+      joint_noise_scale: factor on `joint_noise`. An agent that trains with more than 1 has seen a
+        wider range of poses than it is judged from.
       placement: when the task's objects get new places: `fixed` (never), `after_success` (as the
         paper trains: a place outlives failed episodes) or `always`; None for `fixed` in A and
         `after_success` in B.
@@ -53,7 +65,8 @@ class EnvConfig:
     shadows: bool = False
     reward: str = ""
     reward_scale: Positive = 1.0
-    joint_noise: float | None = None
+    joint_noise: NotNegative | None = None
+    joint_noise_scale: Positive = 1.0
     placement: Literal["fixed", "after_success", "always"] | None = None
     max_steps: Count = 1000
     degrees_per_action: Positive = 1.0
@@ -70,8 +83,11 @@ class EnvConfig:
             )
         if not self.cameras:
             raise ValueError("camera must name at least one camera, got ()")
-        if self.joint_noise is not None and not 0.0 <= self.joint_noise <= 45.0:
-            raise ValueError(f"joint_noise must be from 0 to 45 degrees, got {self.joint_noise}")
+        if self.noise_degrees > _MOST_NOISE:
+            raise ValueError(
+                f"joint_noise * joint_noise_scale must be at most {_MOST_NOISE:g} degrees, "
+                f"got {self.noise_degrees:g}"
+            )
 
     @property
     def scene_name(self) -> str:
@@ -80,8 +96,9 @@ class EnvConfig:
 
     @property
     def noise_degrees(self) -> float:
-        """`joint_noise`, or what it is in this environment."""
-        return _JOINT_NOISE[self.env] if self.joint_noise is None else self.joint_noise
+        """How far each joint starts from home at most, degrees."""
+        noise = _JOINT_NOISE[self.env] if self.joint_noise is None else self.joint_noise
+        return noise * self.joint_noise_scale
 
     @property
     def placed(self) -> str:
@@ -110,6 +127,7 @@ def env_config(env: str = "A", **values: Any) -> EnvConfig:
 def set_env_options(config: EnvConfig, values: dict[str, Any]) -> EnvConfig:
     """The same options with some changed; another task comes with its own options."""
     task = values.get("task", config.task)
+    check_value("task", str, task)
     if task != config.task:
         config = dataclasses.replace(config, task=task, task_options=find_task(task).config())
     return set_options(config, values)

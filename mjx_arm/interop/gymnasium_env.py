@@ -18,8 +18,8 @@ from mjx_arm.envs.env import Env, make
 from mjx_arm.envs.state import EnvState
 from mjx_arm.physics import compiler_options
 
-# Edge of the pictures of `render`, pixels, and of how many a second.
-_PICTURE = 256
+# Edge of the images of `render`, pixels, and how many of them make a second of video.
+_EDGE = 256
 _FPS = 30
 # The process that imported jax; a fork of it has none of the threads that jax waits for.
 _PROCESS = os.getpid()
@@ -51,24 +51,24 @@ def _jit(env: Env, function: Any) -> Any:
 
 
 def _numpy(tree: Any) -> Any:
-    # Copies: what gymnasium hands out may be written to and kept.
+    # Copies, because the caller may keep and change them.
     return jax.tree.map(np.array, tree)
 
 
 class ArmCubeEnv(gymnasium.Env[Any, np.int64]):
-    """One environment, for anything that speaks gymnasium.
+    """One environment with the interface of gymnasium.
 
-    `reset` with a seed starts anew; without one it starts the next episode, with what outlives the
-    last one (where the cube lies in environment B). Episodes end by themselves, truncated after
-    `max_steps`: no `TimeLimit` is needed. `info` has what `Env.step` says.
+    `reset` with a seed forgets all earlier episodes. `reset` without one starts the next episode,
+    and keeps what outlives an episode: in environment B, the cube's place after a failure. Episodes
+    are truncated after `max_steps`, so no `TimeLimit` is needed. `info` is that of `Env.step`.
 
     Args:
       name: environment, `"A"` or `"B"`.
-      render_mode: None or `"rgb_array"`, a picture of 256 by 256 pixels with shadows.
+      render_mode: None or `"rgb_array"`, an image of 256 by 256 pixels with shadows.
       **options: fields of `EnvConfig`, such as `observation` or `physics`.
 
     Raises:
-      ValueError: unknown environment or option, or a value out of its domain.
+      ValueError: unknown environment or option, or an invalid value.
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": _FPS}  # noqa: RUF012
@@ -92,9 +92,9 @@ class ArmCubeEnv(gymnasium.Env[Any, np.int64]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Starts an episode; `options` are not used."""
+        """Starts an episode. `options` are ignored."""
         super().reset(seed=seed)
-        key = _draw_key(self.np_random)
+        key = _sample_key(self.np_random)
         if seed is not None or self._state is None:
             obs, self._state = self._reset(key)
         else:
@@ -117,33 +117,33 @@ class ArmCubeEnv(gymnasium.Env[Any, np.int64]):
         return _numpy(obs), float(reward), *flags, {k: v.item() for k, v in _numpy(info).items()}
 
     def render(self) -> Any:
-        """A picture `[256, 256, 3] uint8` of the scene, or None without a render mode."""
+        """An image `[256, 256, 3] uint8` of the scene, or None without a render mode."""
         if self.render_mode is None or self._state is None:
             return None
-        return np.array(self._draw(self._state))
+        return np.array(self._render_image(self._state))
 
     @functools.cached_property
-    def _draw(self) -> Any:
-        return jax.jit(_make_picture(self.env))
+    def _render_image(self) -> Any:
+        return jax.jit(_make_image(self.env))
 
 
 class ArmCubeVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
-    """Many environments in one jitted call; what `gymnasium.make_vec` makes of our ids.
+    """Many environments that step in one jitted call; `gymnasium.make_vec` makes this class.
 
     With `autoreset="next_step"` (gymnasium's default) the step after the end of an episode ignores
-    its action and returns the next one's first observation; with `"same_step"` the step that ends
-    it does, and the true last observation is in `info["final_obs"]`, the rest of what is known of
-    it in `info["final_info"]`.
+    its action and returns the first observation of the next episode. With `"same_step"` the step
+    that ends an episode returns that observation; the last observation of the old episode is then
+    in `info["final_obs"]`, and its info in `info["final_info"]`.
 
     Args:
       name: environment, `"A"` or `"B"`.
-      num_envs: how many.
+      num_envs: number of environments.
       autoreset: `"next_step"` or `"same_step"`.
-      render_mode: None or `"rgb_array"`, pictures of all environments.
+      render_mode: None or `"rgb_array"`, an image of each environment.
       **options: fields of `EnvConfig`.
 
     Raises:
-      ValueError: unknown environment or option, or a value out of its domain.
+      ValueError: unknown environment or option, or an invalid value.
     """
 
     def __init__(
@@ -174,7 +174,7 @@ class ArmCubeVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         self._state: Any = None
 
     def _keys(self) -> jax.Array:
-        return jax.random.split(_draw_key(self.np_random), self.num_envs)
+        return jax.random.split(_sample_key(self.np_random), self.num_envs)
 
     def reset(
         self, *, seed: int | list[int] | None = None, options: dict[str, Any] | None = None
@@ -219,7 +219,7 @@ class ArmCubeVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         return _numpy(obs), reward, terminated, truncated, self._info(_numpy(info))
 
     def _info(self, info: dict[str, Any]) -> dict[str, Any]:
-        """With gymnasium's masks: `_name` says for which environments `name` holds."""
+        """Adds gymnasium's masks: `_name` says for which environments `name` is valid."""
         reset = info.pop("reset")
         if self._auto.mode == "next_step":
             masked = dict.fromkeys(info, ~reset)
@@ -237,20 +237,20 @@ class ArmCubeVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         return info | {f"_{name}": mask for name, mask in masked.items()}
 
     def render(self) -> tuple[Any, ...] | None:
-        """Pictures `[256, 256, 3] uint8` of all environments, or None without a render mode."""
+        """Images `[256, 256, 3] uint8` of all environments, or None without a render mode."""
         if self.render_mode is None or self._state is None:
             return None
-        return tuple(np.array(self._draw(self._state.env)))
+        return tuple(np.array(self._render_image(self._state.env)))
 
     @functools.cached_property
-    def _draw(self) -> Any:
-        return jax.jit(jax.vmap(_make_picture(self.env)))
+    def _render_image(self) -> Any:
+        return jax.jit(jax.vmap(_make_image(self.env)))
 
 
-def _make_picture(env: Env) -> Callable[[EnvState], jax.Array]:
+def _make_image(env: Env) -> Callable[[EnvState], jax.Array]:
     """Makes `state -> [256, 256, 3] uint8`, the image of the first camera."""
     first = env.with_cameras(
-        camera=env.config.cameras[0], size=(_PICTURE, _PICTURE), shadows=True, observation="rgb"
+        camera=env.config.cameras[0], size=(_EDGE, _EDGE), shadows=True, observation="rgb"
     )
     return first.observe  # type: ignore[return-value]
 
@@ -272,7 +272,7 @@ def _where_first(mask: np.ndarray, new: Any, old: Any) -> Any:
     return jax.tree.map(choose, new, old)
 
 
-def _draw_key(generator: np.random.Generator) -> jax.Array:
+def _sample_key(generator: np.random.Generator) -> jax.Array:
     return jax.random.key(generator.integers(2**32, dtype=np.uint32))
 
 

@@ -1,4 +1,4 @@
-"""The environments as gymnax environments: of its version 1 (six values), and classic (five)."""
+"""The environments as gymnax environments: `step` of version 1 (six values) or older (five)."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ class GymnaxEnv(Environment):
     """An environment of gymnax 1.0: `step` gives six values and resets in the same step.
 
     `info["final_observation"]` has the true last observation of an episode, at every step. In
-    environment B a start is handed what outlives an episode; see `mjx_arm.Env.restart`.
+    environment B the cube keeps its place after a failed episode; see `mjx_arm.Env.restart`.
 
     Args:
       name: environment, `"A"` or `"B"`.
       **options: fields of `EnvConfig`, but for `rgbd`: gymnax has no space for it.
 
     Raises:
-      ValueError: unknown environment or option, or a value out of its domain.
+      ValueError: unknown environment or option, or an invalid value.
     """
 
     def __init__(self, name: str = "A", **options: Any):
@@ -43,7 +43,7 @@ class GymnaxEnv(Environment):
 
     @property
     def default_params(self) -> EnvParams:
-        """Parameters that episodes of `EnvConfig.max_steps` have."""
+        """Parameters that truncate episodes after `EnvConfig.max_steps`."""
         return EnvParams(max_steps_in_episode=self.env.config.max_steps)
 
     @partial(jax.jit, static_argnames=("self",))
@@ -57,7 +57,7 @@ class GymnaxEnv(Environment):
         """
         params = self.default_params if params is None else params
         state, transition = self.env.transition(state, jnp.asarray(action, jnp.int32))
-        # By this length alone, which may be more than that of the environment's own configuration.
+        # Only by the length in `params`, which may be longer than `EnvConfig.max_steps`.
         too_long = state.step >= params.max_steps_in_episode
         truncated = (too_long | transition.info["diverged"]) & ~transition.terminated
         ended = transition.terminated | truncated
@@ -76,7 +76,7 @@ class GymnaxEnv(Environment):
         return obs, state, transition.reward, transition.terminated, truncated, info
 
     def reset_env(self, key: jax.Array, params: EnvParams) -> tuple[Any, EnvState]:
-        """Starts an episode that owes nothing to an earlier one."""
+        """Starts an episode that does not depend on earlier ones."""
         del params
         return self.env.reset(key)
 

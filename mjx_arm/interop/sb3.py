@@ -1,4 +1,4 @@
-"""The environments as Stable-Baselines3's `VecEnv`: many of them in one jitted call a step."""
+"""The environments as a `VecEnv` of Stable-Baselines3, which steps them in one jitted call."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from mjx_arm.interop.gymnasium_env import ArmCubeVectorEnv
 class ArmCubeVecEnv(VecEnv):
     """Many environments, for any algorithm of Stable-Baselines3.
 
-    A single one needs no adapter, nor do a few in a `DummyVecEnv`; these all step at once. `infos`
-    have `success`, the same as `is_success`, `grasped`, `height`, `distance` and the rest of
-    the `info` of `Env.step`.
+    All environments step in one call. A single environment needs no adapter: Stable-Baselines3
+    takes `ArmCubeEnv`. `infos` have `is_success`, which equals `success`, and the rest of the
+    `info` of `Env.step`, such as `grasped`, `height` and `distance`.
 
     Args:
       name: environment, `"A"` or `"B"`.
-      num_envs: how many.
+      num_envs: number of environments.
       render_mode: None or `"rgb_array"`.
       **options: fields of `EnvConfig`.
 
     Raises:
-      ValueError: unknown environment or option, or a value out of its domain.
+      ValueError: unknown environment or option, or an invalid value.
     """
 
     def __init__(
@@ -37,7 +37,7 @@ class ArmCubeVecEnv(VecEnv):
         super().__init__(num_envs, *spaces)
 
     def reset(self) -> Any:
-        """Starts an episode in every environment; the first of the seeds is that of all."""
+        """Starts an episode in every environment. Only the first of the seeds is used."""
         obs, _ = self._envs.reset(seed=self._seeds[0])
         self._reset_seeds()
         return obs
@@ -63,18 +63,18 @@ class ArmCubeVecEnv(VecEnv):
         return obs, reward, ended, infos
 
     def get_images(self) -> Sequence[np.ndarray | None]:
-        """Pictures `[256, 256, 3] uint8` of all environments, or None without a render mode."""
+        """Images `[256, 256, 3] uint8` of all environments, or None without a render mode."""
         return self._envs.render() or [None] * self.num_envs
 
     def close(self) -> None:
-        """Nothing is held that needs it."""
+        """Does nothing: there is nothing to close."""
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        """An attribute of the environments, which they share, for each of some."""
+        """An attribute, which all environments share, once for each index."""
         return [getattr(self._envs, attr_name) for _ in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        """Refused: the environments are one compiled program.
+        """Not supported: the environments are one compiled program.
 
         Raises:
           AttributeError: always.
@@ -82,7 +82,7 @@ class ArmCubeVecEnv(VecEnv):
         raise AttributeError(f"{attr_name} cannot be set: make the environments with other options")
 
     def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> Any:
-        """Refused: there is no single environment to call.
+        """Not supported: there is no single environment to call.
 
         Raises:
           AttributeError: always.
@@ -90,5 +90,5 @@ class ArmCubeVecEnv(VecEnv):
         raise AttributeError(f"{method_name} cannot be called on one environment of many")
 
     def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
-        """They are not wrapped in anything."""
+        """False for each index: no environment is wrapped."""
         return [False for _ in self._get_indices(indices)]

@@ -290,8 +290,11 @@ def _expanded(varies: Varies) -> set[str]:
 
 
 def _num_threads(simulations: int) -> int:
-    """Number of threads of a Batch: a thread without a simulation would be woken for nothing."""
-    return min(simulations, usable_cores())
+    """Number of threads of a Batch: a thread without a simulation would be woken for nothing.
+
+    The local devices of a sharded program step at the same time, so they divide the cores.
+    """
+    return min(simulations, max(1, usable_cores() // jax.local_device_count()))
 
 
 def _name_of(mj_model: mujoco.MjModel, substeps: int, varies: Varies) -> str:

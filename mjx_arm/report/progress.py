@@ -56,6 +56,13 @@ def say_device(console: Console) -> None:
         )
 
 
+def say_mesh(console: Console, devices: int, *, by_seed: bool) -> None:
+    """Says what several devices do."""
+    of_processes = f" of {jax.process_count()} processes" if jax.process_count() > 1 else ""
+    what = "some of the seeds" if by_seed else "a part of the environments, the replay and batches"
+    console.print(f"devices: {devices}{of_processes}, each with {what}; memory is that of one")
+
+
 def say_memory(console: Console, plan: dict[str, int]) -> None:
     """Says what the run will hold in memory."""
     parts = ", ".join(f"{name} {size / 1e6:.1f} MB" for name, size in plan.items())

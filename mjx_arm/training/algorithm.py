@@ -11,9 +11,12 @@ from mjx_arm.algos.frames import make_frames
 from mjx_arm.config import DistillConfig, DQNConfig, TrainConfig
 from mjx_arm.envs.env import Env
 from mjx_arm.networks import FeatureQNetwork, make_network
+from mjx_arm.shard import WHOLE, Shard
 
 
-def make_algorithm(config: TrainConfig, env: Env, network: Any = None) -> Algorithm:
+def make_algorithm(
+    config: TrainConfig, env: Env, network: Any = None, *, shard: Shard = WHOLE
+) -> Algorithm:
     """Makes the algorithm of a configuration.
 
     Args:
@@ -21,6 +24,8 @@ def make_algorithm(config: TrainConfig, env: Env, network: Any = None) -> Algori
       env: the environment that it trains in.
       network: a Flax module `observations [B, ...] -> Q-values [B, A]`; by default the one that
         the configuration names.
+      shard: the part of the environments and of each batch that the algorithm sees. Its `learn`
+        then runs inside `jax.shard_map` and averages its gradients over all parts.
 
     Raises:
       ValueError: the network cannot be made.
@@ -35,13 +40,14 @@ def make_algorithm(config: TrainConfig, env: Env, network: Any = None) -> Algori
     storage, algo = config.replay.storage, config.algo
     if isinstance(algo, DistillConfig):
         frames = make_frames(env, storage, with_features=True)
-        return Distill(algo, frames, make_teacher(algo, env), network, config.num_envs)
+        teacher = make_teacher(algo, env, shard)
+        return Distill(algo, frames, teacher, network, config.num_envs)
     assert isinstance(algo, DQNConfig)
-    learning = make_q_learning(algo, network, pixels=not from_state)
+    learning = make_q_learning(algo, network, pixels=not from_state, shard=shard)
     return DQN(algo, make_frames(env, storage), learning, config.num_envs)
 
 
-def make_teacher(config: DistillConfig, env: Env) -> QLearning:
+def make_teacher(config: DistillConfig, env: Env, shard: Shard = WHOLE) -> QLearning:
     """Q-learning of a network that sees the state features."""
     network: Any = FeatureQNetwork(
         env.num_actions,
@@ -58,4 +64,5 @@ def make_teacher(config: DistillConfig, env: Env) -> QLearning:
         huber=True,
         polyak=config.teacher_polyak,
         target_period=1,
+        shard=shard,
     )

@@ -16,13 +16,15 @@ import pathlib
 import shutil
 import tempfile
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 
 from mjx_arm.training.memory import tree_size
+from mjx_arm.training.mesh import place
+from mjx_arm.training.processes import is_writer, on_writer
 from mjx_arm.training.seal import is_sealed, seal
 
 _KEPT = 2
@@ -55,6 +57,9 @@ def save_tree(
 ) -> None:
     """Writes a pytree of arrays to a folder: whole, or not at all.
 
+    With several processes all of them must call it, and see the same folder. Each writes its part
+    of what is spread over them.
+
     Args:
       path: of the folder; what is there is replaced.
       tree: the arrays.
@@ -65,18 +70,48 @@ def save_tree(
       ValueError: the disk is full, or the folder cannot be written.
     """
     part = path.with_name(f"{path.name}.part")
-    try:
+
+    def prepare() -> None:
         shutil.rmtree(part, ignore_errors=True)
         part.mkdir(parents=True)
         _check_room(part, tree_size(tree) + _OVERHEAD)
-        _write_arrays(part / _STATE, tree)
+
+    def complete() -> None:
         write_manifest(part, tree, origin=origin, step=step)
         shutil.rmtree(path, ignore_errors=True)
         part.replace(path)
+
+    with _whole_or_none(path, part):
+        _on_writer(prepare)
+        _write_arrays(part / _STATE, tree)
+        _on_writer(complete)
+
+
+@contextlib.contextmanager
+def _whole_or_none(path: pathlib.Path, part: pathlib.Path) -> Iterator[None]:
+    """Removes what was written of a checkpoint when that fails, and says so in one sentence."""
+    try:
+        yield
     except (OSError, ValueError) as error:
-        shutil.rmtree(part, ignore_errors=True)
-        reason = getattr(error, "strerror", None) or " ".join(str(error).split())[:200]
-        raise ValueError(f"the checkpoint {path} could not be written: {reason}") from error
+        if is_writer():
+            shutil.rmtree(part, ignore_errors=True)
+        raise ValueError(f"the checkpoint {path} could not be written: {_reason(error)}") from error
+
+
+def _on_writer(function: Callable[[], None]) -> None:
+    """Runs a function in the process that writes; an OSError becomes a ValueError in all."""
+
+    def run() -> None:
+        try:
+            function()
+        except OSError as error:
+            raise ValueError(_reason(error)) from error
+
+    on_writer(run)
+
+
+def _reason(error: Exception) -> str:
+    return getattr(error, "strerror", None) or " ".join(str(error).split())[:200]
 
 
 def _check_room(folder: pathlib.Path, size: int) -> None:
@@ -129,7 +164,10 @@ def write_manifest(
 
 
 def load_tree(path: pathlib.Path, like: Any) -> Any:
-    """Reads a pytree with the structure, shapes and dtypes of `like`.
+    """Reads a pytree with the structure, shapes, dtypes and shardings of `like`.
+
+    The shardings may differ from those that it was written with. With several processes all of them
+    must call it.
 
     Raises:
       ValueError: there is no checkpoint, or it is damaged, or of something else.
@@ -137,7 +175,7 @@ def load_tree(path: pathlib.Path, like: Any) -> Any:
     import orbax.checkpoint as ocp
 
     # A read that fails half-way leaves orbax with coroutines to complain of.
-    check_tree(path, like)
+    on_writer(lambda: check_tree(path, like))
     with ocp.StandardCheckpointer() as checkpointer:
         data = checkpointer.restore((path / _STATE).absolute(), _here(_to_data(like)))
     return _from_data(data, like)
@@ -251,8 +289,9 @@ class RunCheckpoints:
           ValueError: it could not be written.
         """
         save_tree(self._path(vector_step), state, origin=self._origin, step=vector_step)
-        for step in self.steps()[:-_KEPT]:
-            shutil.rmtree(self._path(step))
+        if is_writer():
+            for step in self.steps()[:-_KEPT]:
+                shutil.rmtree(self._path(step))
 
     def steps(self) -> list[int]:
         """Vector steps of the checkpoints there are, the oldest first."""
@@ -326,7 +365,8 @@ def _to_data(tree: Any) -> dict[str, Any]:
         if not _is_key(leaf):
             return leaf
         if isinstance(leaf, jax.ShapeDtypeStruct):
-            return jax.eval_shape(jax.random.key_data, leaf)
+            data = jax.eval_shape(jax.random.key_data, leaf)
+            return jax.ShapeDtypeStruct(data.shape, data.dtype, sharding=leaf.sharding)
         return jax.random.key_data(leaf)
 
     leaves = enumerate(jax.tree.leaves(tree))
@@ -334,10 +374,14 @@ def _to_data(tree: Any) -> dict[str, Any]:
 
 
 def _here(data: dict[str, Any]) -> dict[str, Any]:
-    """Shapes and dtypes on this machine's device; the checkpoint's own may not be here."""
-    device = jax.sharding.SingleDeviceSharding(jax.devices()[0])
+    """Shapes and dtypes on the devices that they name, or else on this machine's own.
+
+    The devices that the checkpoint was written from may not be here.
+    """
+    device = jax.sharding.SingleDeviceSharding(jax.local_devices()[0])
     return {
-        name: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=device) for name, x in data.items()
+        name: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=x.sharding or device)
+        for name, x in data.items()
     }
 
 
@@ -349,4 +393,5 @@ def _from_data(data: dict[str, Any], like: Any) -> Any:
         return jax.random.wrap_key_data(x) if _is_key(wanted) else x
 
     leaves, structure = jax.tree.flatten(like)
-    return jax.tree.unflatten(structure, [convert(i, x) for i, x in enumerate(leaves)])
+    tree = jax.tree.unflatten(structure, [convert(i, x) for i, x in enumerate(leaves)])
+    return place(tree, like)

@@ -12,6 +12,7 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import PartitionSpec as P
 from scipy.stats import binomtest
 
 from mjx_arm.algos.collect import Counts, Episodes, act, count_episodes, init_episodes, means
@@ -20,6 +21,8 @@ from mjx_arm.envs.auto_reset import AutoReset, AutoResetState
 from mjx_arm.envs.env import Env
 from mjx_arm.options import Count, check_value
 from mjx_arm.physics import compiler_options
+from mjx_arm.shard import WHOLE, Shard
+from mjx_arm.training.mesh import fetch, replicate, shard_of, sharded
 
 # Environments side by side, and iterations in one compiled call.
 _MAX_ENVS = 200
@@ -62,7 +65,12 @@ class _Run:
 
 
 def make_evaluator(
-    env: Env, apply: Apply, *, episodes: int, epsilon: float
+    env: Env,
+    apply: Apply,
+    *,
+    episodes: int,
+    epsilon: float,
+    mesh: jax.sharding.Mesh | None = None,
 ) -> Callable[[Any, jax.Array], Evaluation]:
     """Makes `(params, key) -> Evaluation`, which runs an epsilon-greedy policy; compiles once.
 
@@ -74,6 +82,8 @@ def make_evaluator(
       apply: `(params, obs [N, ...]) -> Q-values [N, A]`.
       episodes: how many.
       epsilon: share of random actions.
+      mesh: devices to spread the environments over, by its one axis. Starts and random actions do
+        not depend on their number. With several processes all of them must evaluate.
 
     Returns:
       A function of the network's parameters and of a key for starts and random actions.
@@ -83,22 +93,49 @@ def make_evaluator(
     """
     check_value("episodes", Count, episodes)
     check_epsilon(epsilon)
-    auto = AutoReset(env)
-
-    def advance_run(params: Any, run: _Run) -> _Run:
-        step = functools.partial(_step, auto, apply, params, epsilon)
-        return jax.lax.fori_loop(0, _CHUNK, lambda _, run: step(run), run)
-
-    advance = jax.jit(advance_run, compiler_options=compiler_options(env.physics))
-    start = jax.jit(functools.partial(_start, auto, episodes))
+    start, advance = make_programs(env, apply, episodes=episodes, epsilon=epsilon, mesh=mesh)
 
     def evaluate_params(params: Any, key: jax.Array) -> Evaluation:
-        run = start(key)
-        while int(jnp.max(run.left)) > 0:
-            run = advance(params, run)
-        return _summarise(jax.device_get(run.counts), episodes)
+        params, run, left = replicate(params, mesh), start(replicate(key, mesh)), 1
+        while left > 0:
+            run, most = advance(params, run)
+            left = int(most)
+        return _summarise(fetch(run.counts), episodes)
 
     return evaluate_params
+
+
+def make_programs(
+    env: Env,
+    apply: Apply,
+    *,
+    episodes: int,
+    epsilon: float,
+    mesh: jax.sharding.Mesh | None,
+) -> tuple[jax.stages.Wrapped, jax.stages.Wrapped]:
+    """The compiled functions of an evaluator; see `make_evaluator`.
+
+    Returns:
+      `key -> run`, and `(params, run) -> (run, most episodes that an environment has left)`.
+    """
+    auto, shard = AutoReset(env), shard_of(mesh)
+
+    def advance_run(params: Any, run: _Run) -> tuple[_Run, jax.Array]:
+        step = functools.partial(_step, auto, apply, params, epsilon, shard)
+        run = dataclasses.replace(run, counts=shard.keep_first(run.counts))
+        run = jax.lax.fori_loop(0, _CHUNK, lambda _, run: step(run), run)
+        run = dataclasses.replace(run, counts=shard.total(run.counts))
+        return run, shard.largest(jnp.max(run.left))
+
+    specs = _specs(shard)
+    advance = jax.jit(
+        sharded(advance_run, mesh, (P(), specs), (specs, P())),
+        compiler_options=compiler_options(env.physics),
+    )
+    start = jax.jit(
+        sharded(functools.partial(_start, auto, episodes, shard=shard), mesh, P(), specs)
+    )
+    return start, advance
 
 
 def _summarise(totals: dict[str, Any], episodes: int) -> Evaluation:
@@ -125,45 +162,66 @@ def _summarise(totals: dict[str, Any], episodes: int) -> Evaluation:
 
 
 def evaluate(
-    env: Env, apply: Apply, params: Any, *, episodes: int, epsilon: float, key: jax.Array
+    env: Env,
+    apply: Apply,
+    params: Any,
+    *,
+    episodes: int,
+    epsilon: float,
+    key: jax.Array,
+    mesh: jax.sharding.Mesh | None = None,
 ) -> Evaluation:
     """Runs one policy once; see `make_evaluator`."""
-    return make_evaluator(env, apply, episodes=episodes, epsilon=epsilon)(params, key)
+    evaluator = make_evaluator(env, apply, episodes=episodes, epsilon=epsilon, mesh=mesh)
+    return evaluator(params, key)
 
 
-def _start(auto: AutoReset, episodes: int, key: jax.Array) -> _Run:
-    num_envs = min(episodes, _MAX_ENVS)
+def _specs(shard: Shard) -> _Run:
+    """How a run is spread over the shards."""
+    own: Any = P(shard.axis)
+    everywhere: Any = P()
+    return _Run(own, own, everywhere, own, own, everywhere)
+
+
+def _start(auto: AutoReset, episodes: int, key: jax.Array, shard: Shard = WHOLE) -> _Run:
+    side_by_side = min(episodes, _MAX_ENVS)
+    # Each shard has as many environments; those that are left over run no episode.
+    num_envs = -(-side_by_side // shard.count)
+    rows = num_envs * shard.count
     reset_key, key = jax.random.split(key)
-    obs, envs = jax.vmap(auto.reset)(jax.random.split(reset_key, num_envs))
-    quota = np.full(num_envs, episodes // num_envs)
-    quota[: episodes % num_envs] += 1
+    obs, envs = jax.vmap(auto.reset)(shard.own(jax.random.split(reset_key, rows)))
+    quota = np.zeros(rows, int)
+    quota[:side_by_side] = episodes // side_by_side
+    quota[: episodes % side_by_side] += 1
     run = _Run(
         envs=envs,
         obs=obs,
         key=key,
-        left=jnp.asarray(quota, jnp.int32),
+        left=shard.own(jnp.asarray(quota, jnp.int32)),
         running=init_episodes(auto, envs),
         counts={},
     )
     # One abstract step says which counts there are.
     q = jax.ShapeDtypeStruct((num_envs, auto.env.num_actions), jnp.float32)
-    names = jax.eval_shape(lambda run, q: _count(auto, run, key, q, 0.0)[1].counts, run, q)
+    names = jax.eval_shape(lambda run, q: _count(auto, run, key, q, 0.0, shard)[1].counts, run, q)
     return dataclasses.replace(
         run, counts={name: jnp.zeros((), x.dtype) for name, x in names.items()}
     )
 
 
-def _step(auto: AutoReset, apply: Apply, params: Any, epsilon: float, run: _Run) -> _Run:
+def _step(
+    auto: AutoReset, apply: Apply, params: Any, epsilon: float, shard: Shard, run: _Run
+) -> _Run:
     key, act_key = jax.random.split(run.key)
-    envs, run = _count(auto, run, act_key, apply(params, run.obs), epsilon)
+    envs, run = _count(auto, run, act_key, apply(params, run.obs), epsilon, shard)
     obs = jax.vmap(auto.env.observe)(envs.env)
     return dataclasses.replace(run, envs=envs, obs=obs, key=key)
 
 
 def _count(
-    auto: AutoReset, run: _Run, key: jax.Array, q: jax.Array, epsilon: float
+    auto: AutoReset, run: _Run, key: jax.Array, q: jax.Array, epsilon: float, shard: Shard
 ) -> tuple[AutoResetState, _Run]:
-    _, envs, transition = act(auto, key, run.envs, q, jnp.float32(epsilon))
+    _, envs, transition = act(auto, key, run.envs, q, jnp.float32(epsilon), shard)
     counted = run.left > 0
     running, counts = count_episodes(run.running, transition, q, counted)
     ended = (transition.terminated | transition.truncated) & counted

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
+import inspect
 from collections.abc import Callable
 from typing import Any
 
 import flax.struct
 import jax
 import jax.numpy as jnp
+from jax.sharding import Mesh
+from jax.sharding import PartitionSpec as P
 
 from mjx_arm.algos.base import Algorithm
 from mjx_arm.algos.collect import Counts, Episodes, act, count_episodes, init_episodes, means
@@ -20,7 +23,16 @@ from mjx_arm.envs.env import Env, make_env
 from mjx_arm.envs.tasks.base import Reward
 from mjx_arm.microbatch import microbatched, overwrite_microbatched
 from mjx_arm.physics import compiler_options
+from mjx_arm.shard import WHOLE, Shard
 from mjx_arm.training.algorithm import make_algorithm
+from mjx_arm.training.mesh import (
+    check_division,
+    replicate,
+    shard_of,
+    sharded,
+    shards_seeds,
+    with_shardings,
+)
 
 # Each use of a run's seed has its own keys, so that training never sees what judges it.
 TRAINING, SELECTION, EVALUATION = range(3)
@@ -63,6 +75,9 @@ class Trainer:
       init: `key -> LoopState`.
       run_chunk: `LoopState -> (LoopState, Counts)`, compiled; donates its argument. The counts are
         those of the chunk.
+      mesh: the devices that share the work, or None for one device.
+      specs: how the state is spread over the mesh: a `LoopState` of `PartitionSpec`s, each for
+        everything below it.
 
     With `num_seeds` above 1 keys, states and counts have a leading axis of seeds.
     """
@@ -72,6 +87,18 @@ class Trainer:
     algorithm: Algorithm
     init: jax.stages.Wrapped
     run_chunk: jax.stages.Wrapped
+    mesh: Mesh | None = None
+    specs: Any = None
+
+    def start(self) -> LoopState:
+        """The state before the first step of the run of the configuration."""
+        state: LoopState = self.init(replicate(run_keys(self.config), self.mesh))
+        return state
+
+    def shapes(self) -> LoopState:
+        """The shapes of the state, with their shardings where there is a mesh."""
+        shapes: LoopState = jax.eval_shape(self.init, run_keys(self.config))
+        return with_shardings(shapes, self.mesh, self.specs)
 
 
 def make_trainer(
@@ -80,7 +107,8 @@ def make_trainer(
     env: Env | None = None,
     network: Any = None,
     reward: Reward | None = None,
-    algorithm: Callable[[TrainConfig, Env], Algorithm] | None = None,
+    algorithm: Callable[..., Algorithm] | None = None,
+    mesh: Mesh | None = None,
 ) -> Trainer:
     """Makes the functions of a training run.
 
@@ -91,29 +119,73 @@ def make_trainer(
       network: a Flax module `observations [B, ...] -> Q-values [B, A]`; by default the one that
         the configuration names.
       reward: a function as in `mjx_arm.make`; by default the one that the configuration names.
-      algorithm: makes an algorithm of one's own; by default that of the configuration.
+      algorithm: makes an algorithm of one's own from the configuration and the environment; by
+        default that of the configuration. Where several devices share a seed it is also called
+        with `shard=`, and its `learn` must average the gradients by `shard.mean`.
+      mesh: devices that share the work, along its one axis. They take equal parts of the seeds, or
+        where their number does not divide that of the seeds, of the environments, the replay and
+        each batch of every seed.
 
     Raises:
-      ValueError: the environment or the network cannot be made.
+      ValueError: the environment or the network cannot be made, or the work cannot be divided.
     """
-    body = make_body(config, env=env, network=network, reward=reward, algorithm=algorithm)
+    parts = {"env": env, "network": network, "reward": reward, "algorithm": algorithm}
+    by_seed = mesh is not None and shards_seeds(config, mesh.size)
+    shard = WHOLE if by_seed else shard_of(mesh)
+    body = make_body(config, **parts, shard=shard)
     config, init, run_chunk = body.config, body.init, body.run_chunk
-    if config.num_seeds > 1:
+    seeds = config.num_seeds > 1
+    if seeds:
         init, run_chunk = jax.vmap(init), jax.vmap(run_chunk)
+    specs = _seed_specs(mesh) if by_seed else state_specs(shard, seeds=seeds)
+    keys = specs.key if by_seed else P()
     own = body.env.env
     return Trainer(
         config=config,
         env=own,
         algorithm=body.algorithm,
-        init=jax.jit(init),
+        init=jax.jit(sharded(init, mesh, keys, specs)),
         run_chunk=jax.jit(
-            run_chunk, donate_argnums=0, compiler_options=compiler_options(own.physics)
+            sharded(run_chunk, mesh, (specs,), (specs, specs.counts)),
+            donate_argnums=0,
+            compiler_options=compiler_options(own.physics),
         ),
+        mesh=mesh,
+        specs=specs,
     )
 
 
+def state_specs(shard: Shard, *, seeds: bool = False) -> Any:
+    """How a `LoopState` is spread where the shards have equal parts of the environments.
+
+    Args:
+      shard: the part of one device.
+      seeds: whether the state has a leading axis of seeds.
+    """
+    first = (None,) if seeds else ()
+    envs: Any = P(*first, shard.axis)
+    slots: Any = P(*first, None, shard.axis)
+    everywhere: Any = P()
+    return LoopState(
+        learner=everywhere,
+        envs=envs,
+        obs=envs,
+        replay=Replay(steps=slots, count=everywhere),
+        key=everywhere,
+        vector_step=everywhere,
+        episodes=envs,
+        counts=everywhere,
+    )
+
+
+def _seed_specs(mesh: Mesh | None) -> Any:
+    """How a `LoopState` is spread where each device has some of the seeds."""
+    spec: Any = P(shard_of(mesh).axis)
+    return LoopState(**{field.name: spec for field in dataclasses.fields(LoopState)})
+
+
 def make_train(
-    config: TrainConfig, **parts: Any
+    config: TrainConfig, *, mesh: Mesh | None = None, **parts: Any
 ) -> Callable[[jax.Array], tuple[LoopState, Counts]]:
     """Makes a whole training run as one function, for use from Python.
 
@@ -121,6 +193,9 @@ def make_train(
 
     Args:
       config: the options; `seed` and `num_seeds` have no meaning here.
+      mesh: devices that share the environments, the replay and each batch, along its one axis. To
+        give each device some of the seeds instead, leave it out and call `jax.shard_map` with
+        `jax.vmap(train)`, keys and results split along the axis, and `check_vma=False`.
       **parts: `env`, `network`, `reward` or `algorithm`, as in `make_trainer`.
 
     Returns:
@@ -128,16 +203,17 @@ def make_train(
       `[chunks]` each. Pure; may be jitted, and vmapped over keys.
 
     Raises:
-      ValueError: the environment cannot be made.
+      ValueError: the environment cannot be made, or the mesh does not divide the work.
     """
-    body = make_body(config, **parts)
+    config, shard = dataclasses.replace(config, num_seeds=1), shard_of(mesh)
+    body = make_body(config, **parts, shard=shard)
 
     def train(key: jax.Array) -> tuple[LoopState, Counts]:
         return jax.lax.scan(
             lambda state, _: body.run_chunk(state), body.init(key), None, length=config.num_chunks
         )
 
-    return train
+    return sharded(train, mesh, P(), (state_specs(shard), P()))
 
 
 def run_keys(config: TrainConfig) -> jax.Array:
@@ -159,15 +235,36 @@ def make_body(
     env: Env | None = None,
     network: Any = None,
     reward: Reward | None = None,
-    algorithm: Callable[[TrainConfig, Env], Algorithm] | None = None,
+    algorithm: Callable[..., Algorithm] | None = None,
+    shard: Shard = WHOLE,
 ) -> Body:
-    """Makes the body of the scan, for one seed; see `make_trainer`."""
+    """Makes the body of the scan, for one seed and one shard of it; see `make_trainer`."""
+    check_division(dataclasses.replace(config, num_seeds=1), shard.count)
     if env is not None and reward is not None:
         raise ValueError("env= and reward= exclude each other: make env with the reward")
     own = make_env(config.env, reward=reward) if env is None else env
     config = dataclasses.replace(config, env=own.config)
-    made = make_algorithm(config, own, network) if algorithm is None else algorithm(config, own)
-    return Body(config, AutoReset(own), made)
+    if algorithm is None:
+        made = make_algorithm(config, own, network, shard=shard)
+    elif shard.count == 1:
+        made = algorithm(config, own)
+    else:
+        check_takes_shard(algorithm, shard.count)
+        made = algorithm(config, own, shard=shard)
+    return Body(config, AutoReset(own), made, shard)
+
+
+def check_takes_shard(algorithm: Callable[..., Algorithm], devices: int) -> None:
+    """Refuses an algorithm of one's own that would not average its gradients.
+
+    Raises:
+      ValueError: the function that makes it has no argument `shard`.
+    """
+    if "shard" not in inspect.signature(algorithm).parameters:
+        raise ValueError(
+            f"algorithm must be a function (config, env, *, shard) to share a seed among {devices} "
+            "devices: average its gradients by shard.mean, or train on one device"
+        )
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -178,22 +275,30 @@ class Body:
       config: the options.
       env: the environment, which resets itself.
       algorithm: the algorithm.
+      shard: the part of the environments that each function sees. Keys and counters are those of
+        all shards together.
     """
 
     config: TrainConfig
     env: AutoReset
     algorithm: Algorithm
+    shard: Shard = WHOLE
+
+    @property
+    def _num_envs(self) -> int:
+        """Environments of this shard."""
+        return self.shard.part(self.config.num_envs)
 
     def init(self, key: jax.Array) -> LoopState:
         """The state before the first step. Consumes the key."""
         config, frames = self.config, self.algorithm.frames
         reset_key, learner_key, key = jax.random.split(key, 3)
-        keys = jax.random.split(reset_key, config.num_envs)
+        keys = jax.random.split(self.shard.fold(reset_key), self._num_envs)
         # The images that `reset` renders all at once are dropped: 4,096 need 220 MB to work in.
         envs = jax.vmap(self.env.reset)(keys)[1]
         obs = microbatched(frames.observe)(envs)
         frame = frames.encode(envs, obs)
-        nothing = jnp.zeros((config.num_envs,), jnp.bool_)
+        nothing = jnp.zeros((self._num_envs,), jnp.bool_)
         step = Step(
             frame=frame,
             action=nothing.astype(jnp.uint8),
@@ -222,7 +327,14 @@ class Body:
         """Runs `TrainConfig.chunk_length` steps; the counts are theirs."""
         state = dataclasses.replace(state, counts=jax.tree.map(jnp.zeros_like, state.counts))
         state, _ = jax.lax.scan(self.step, state, None, length=self.config.chunk_length)
-        return state, state.counts
+        # Those of learning are of all shards already.
+        metrics = self.algorithm.metrics
+        learned = {*metrics, *metrics.values()}
+        counts = {
+            name: count if name in learned else self.shard.total(count)
+            for name, count in state.counts.items()
+        }
+        return dataclasses.replace(state, counts=counts), counts
 
     def step(self, state: LoopState, _: None) -> tuple[LoopState, None]:
         """Collects, stores, learns and counts one step of all environments."""
@@ -230,9 +342,10 @@ class Body:
         key, act_key, learn_key = jax.random.split(state.key, 3)
         env_steps = state.vector_step * config.num_envs
         epsilon = epsilon_at(config.exploration, env_steps)
-        epsilon = spread_epsilon(config.exploration, epsilon, config.num_envs)
+        epsilon = self.shard.own(spread_epsilon(config.exploration, epsilon, config.num_envs))
         frame = algorithm.frames.encode(state.envs, state.obs)
         q = algorithm.q_values(state.learner, state.obs, frame, env_steps)
+        act_key = self.shard.fold(act_key)
         action, envs, transition = act(self.env, act_key, state.envs, q, epsilon)
         replay = add(
             state.replay,

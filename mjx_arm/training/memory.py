@@ -25,8 +25,18 @@ _NO_LIMIT = 2**60
 
 
 def memory_plan(state: Any) -> dict[str, int]:
-    """Bytes of each part of a `LoopState`, or of its shapes from `jax.eval_shape`."""
-    return {name: tree_size(getattr(state, name)) for name in _PARTS}
+    """Bytes of each part of a `LoopState` on one device, or of its shapes."""
+    return {name: tree_size(_on_one_device(getattr(state, name))) for name in _PARTS}
+
+
+def _on_one_device(tree: Any) -> Any:
+    """The shapes of what one device holds of a tree."""
+
+    def part(x: Any) -> jax.ShapeDtypeStruct:
+        shape = x.shape if x.sharding is None else x.sharding.shard_shape(x.shape)
+        return jax.ShapeDtypeStruct(shape, x.dtype)
+
+    return jax.tree.map(part, tree)
 
 
 def working_memory(compiled: jax.stages.Compiled, physics: Physics, simulations: int) -> int:
@@ -39,13 +49,19 @@ def working_memory(compiled: jax.stages.Compiled, physics: Physics, simulations:
     return host + (int(analysis.temp_size_in_bytes) if analysis else 0)
 
 
-def check_memory(plan: dict[str, int]) -> None:
+def check_memory(plan: dict[str, int], devices: int = 1) -> None:
     """Refuses a plan that cannot fit.
+
+    Args:
+      plan: bytes on one device.
+      devices: number of local devices that hold as much. On CPU they share the machine's memory.
 
     Raises:
       ValueError: it needs more than the device, or on CPU the machine or its container, has free;
         names the setting that takes the most.
     """
+    if jax.default_backend() == "cpu":
+        plan = {name: size * devices for name, size in plan.items()}
     needed, free = sum(plan.values()), free_memory()
     if free is not None and needed > free:
         part = max(plan, key=lambda name: plan[name])
@@ -57,7 +73,7 @@ def check_memory(plan: dict[str, int]) -> None:
 
 def free_memory() -> int | None:
     """Bytes free on the default device, or on CPU in the machine; None where nobody says."""
-    device = jax.devices()[0]
+    device = jax.local_devices()[0]
     if device.platform != "cpu":
         stats = device.memory_stats()
         return stats["bytes_limit"] - stats["bytes_in_use"] if stats else None

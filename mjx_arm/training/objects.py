@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import dataclasses
+import uuid
 from typing import Any
 
 from mjx_arm.config import TrainConfig
 from mjx_arm.envs.tasks import find_task
-from mjx_arm.references import is_importable, is_reference, load_reference, reference_to
+from mjx_arm.references import has_lasting_source, is_reference, load_reference, reference_to
 from mjx_arm.references import source_digest as digest_of
 
 Record = dict[str, dict[str, str]]
+
+# Objects that only this process has, such as lambdas, by the token that a record has of them.
+_ONLY_HERE: dict[str, Any] = {}
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -38,22 +42,32 @@ class Objects:
 def record(config: TrainConfig, objects: Objects) -> Record:
     """Import path and digest of all that is not part of the package.
 
-    Raises:
-      ValueError: an object cannot be imported by another process, such as a lambda.
+    An object that no other process can have, such as a lambda, has a token in place of the digest.
     """
     found = {}
     for name, value in objects.given().items():
         path = reference_to(value)
-        if not is_importable(path):
-            raise ValueError(
-                f"{name} is {path!r}, which no other process can import, so that this run could "
-                "not be resumed: define it at the top of a module"
-            )
-        found[name] = {"given": path, "sha256": digest_of(value)}
+        if has_lasting_source(value):
+            found[name] = {"given": path, "sha256": digest_of(value)}
+        else:
+            token = uuid.uuid4().hex
+            _ONLY_HERE[token] = value
+            found[name] = {"given": path, "only_in": token}
     for name, path in _references(config).items():
         if name not in found:
             found[name] = {"path": path, "sha256": digest_of(_load(name, path))}
     return found
+
+
+def only_here(recorded: Record) -> list[str]:
+    """A sentence about each object that no other process can have."""
+    return [
+        f"{name} is {entry['given']}, which no other process can have: this run cannot be resumed, "
+        "nor its agent be loaded, after this process has ended; to keep them, define it at the top "
+        "of a file"
+        for name, entry in recorded.items()
+        if "only_in" in entry
+    ]
 
 
 def check_record(recorded: Record, config: TrainConfig, objects: Objects, where: str) -> None:
@@ -65,6 +79,13 @@ def check_record(recorded: Record, config: TrainConfig, objects: Objects, where:
     given = objects.given()
     for name, entry in recorded.items():
         path = entry.get("given", entry.get("path", ""))
+        if "only_in" in entry:
+            if name not in given or _ONLY_HERE.get(entry["only_in"]) is not given[name]:
+                raise ValueError(
+                    f"{where} was made with {name}={path}, which only the process that made it "
+                    f"had: train again with a {name} that is defined at the top of a file"
+                )
+            continue
         if "given" in entry and name not in given:
             raise ValueError(f"{where} was made with {name}={path}: pass it again as {name}=")
         value = given[name] if name in given else _load(name, path)

@@ -6,6 +6,7 @@ import contextlib
 import dataclasses
 import json
 import math
+import os
 import pathlib
 import shlex
 import signal
@@ -33,6 +34,7 @@ from mjx_arm.report.progress import (
     make_console,
     say_device,
     say_memory,
+    say_mesh,
     say_working_memory,
 )
 from mjx_arm.report.run_page import write_report
@@ -62,13 +64,15 @@ from mjx_arm.training.loop import (
     SELECTION,
     LoopState,
     Trainer,
+    check_takes_shard,
     make_trainer,
     role_key,
-    run_keys,
     summarise,
 )
 from mjx_arm.training.memory import check_memory, memory_plan, working_memory
-from mjx_arm.training.objects import Objects, check_record, record
+from mjx_arm.training.mesh import fetch, make_mesh, most_devices, place, shards_seeds
+from mjx_arm.training.objects import Objects, check_record, only_here, record
+from mjx_arm.training.processes import any_says, is_writer, on_writer, wait_for_all
 from mjx_arm.training.run_folder import (
     EVALUATION,
     SavedRun,
@@ -118,6 +122,7 @@ def train(
     eval_episodes: int = 200,
     stop_at: float | None = None,
     init_from: str | pathlib.Path | None = None,
+    devices: int | None = None,
     on_chunk: OnChunk | None = None,
     video: bool = True,
     console: Console | None = None,
@@ -128,7 +133,8 @@ def train(
 ) -> list[Evaluation]:
     """Trains an agent and leaves metrics, curves, agents, an evaluation and a video.
 
-    With several seeds each has all this in a folder of its own, `seed-0` and so on.
+    With several seeds each has all this in a folder of its own, `seed-0` and so on. With several
+    processes (`jax.distributed`) each must call this; process 0 writes.
 
     Args:
       config: the options.
@@ -137,6 +143,8 @@ def train(
       eval_episodes: episodes of the evaluation at the end.
       stop_at: end the run when a selection has reached this success rate for every seed.
       init_from: an agent whose network the run starts from.
+      devices: number of local devices that share the work, as `make_trainer` says; by default as
+        many as divide it. 1 is the program for one device.
       on_chunk: called after each chunk with the metrics of each seed and the state, which it may
         read until it returns.
       video: record an episode at the end.
@@ -154,28 +162,30 @@ def train(
       RunInterruptedError: Ctrl-C, SIGTERM, SIGHUP or SIGUSR1.
     """
     _check_options(eval_episodes, stop_at)
-    console = make_console() if console is None else console
+    console = _own_console(console)
     objects = Objects(env=env, network=network, reward=reward, algorithm=algorithm)
-    trainer = _prepare(config, objects, console)
+    trainer = _prepare(config, objects, console, devices)
     config = trainer.config
     recorded = record(config, objects)
+    for sentence in only_here(recorded):
+        console.print(f"[yellow]warning: {sentence}[/yellow]", soft_wrap=True)
     start = None if init_from is None else _read_policy(trainer, pathlib.Path(init_from))
-    folder = (
-        new_run_folder(config.env.env) if folder is None else prepare_folder(pathlib.Path(folder))
-    )
-    with locked(folder):
+    made = pathlib.Path(on_writer(lambda: str(_make_folder(config, folder))))
+    folder = made
+    with _locked(folder):
         console.print(f"run folder: {folder}", soft_wrap=True)
         run_chunk = _compile(trainer, console)
-        state = trainer.init(run_keys(config))
+        state = trainer.start()
         if start is not None:
             learner = trainer.algorithm.with_policy(state.learner, start)
-            state = dataclasses.replace(state, learner=learner)
+            state = place(dataclasses.replace(state, learner=learner), trainer.shapes())
         run = SavedRun(_with_backend(config, trainer), recorded, trainer.env.scene.source)
-        save_run(folder, run)
+        on_writer(lambda: save_run(made, run))
         loop = _Loop(trainer, run, run_chunk, folder, console, stop_at, on_chunk)
         console.print(f"training: {config.total_steps:,} environment steps")
         loop.run(state, 0)
-        return _finish(folder, run, objects, eval_episodes, console, video=video)
+        ending = _Ending(eval_episodes, console, _local_devices(trainer), video)
+        return _finish_on_writer(folder, run, objects, ending)
 
 
 def resume(
@@ -184,6 +194,7 @@ def resume(
     total_steps: int | None = None,
     eval_episodes: int = 200,
     stop_at: float | None = None,
+    devices: int | None = None,
     on_chunk: OnChunk | None = None,
     console: Console | None = None,
     env: Any = None,
@@ -193,8 +204,8 @@ def resume(
 ) -> list[Evaluation]:
     """Continues a run from its newest checkpoint, as if it had never stopped.
 
-    Resuming is bit-exact on the same CPU with the same number of threads. On other hardware the
-    run continues, but not bit for bit.
+    Resuming is bit-exact on the same CPU with the same number of threads, devices and processes. On
+    other hardware, or with another number of them, the run continues, but not bit for bit.
 
     Args:
       folder: the run folder.
@@ -202,6 +213,7 @@ def resume(
         selection that ended a shorter run is kept.
       eval_episodes: episodes of the evaluation at the end.
       stop_at: end the run when a selection has reached this success rate for every seed.
+      devices: see `train`.
       on_chunk: see `train`.
       console: where it prints.
       env: the environment, if the run was started with one.
@@ -215,7 +227,7 @@ def resume(
     """
     _check_options(eval_episodes, stop_at)
     folder = pathlib.Path(folder)
-    console = make_console() if console is None else console
+    console = _own_console(console)
     _check_whole_run(folder)
     saved = load_run(folder)
     check_untouched(folder, saved)
@@ -225,13 +237,14 @@ def resume(
     config = saved.config
     if total_steps is not None:
         config = dataclasses.replace(config, total_steps=total_steps)
-    with locked(folder):
+    with _locked(folder):
         console.print(f"run folder: {folder}", soft_wrap=True)
-        trainer = _prepare(config, objects, console, scene)
+        trainer = _prepare(config, objects, console, devices, scene)
         _check_same_env(config, _with_backend(trainer.config, trainer), folder)
         checkpoints = RunCheckpoints(folder, saved.origin)
-        saved_any = _has_saved(trainer, folder)
-        vector_step = checkpoints.find_newest(_shapes(trainer)) if saved_any else 0
+        shapes = trainer.shapes()
+        found = on_writer(lambda: _newest_step(trainer, folder, checkpoints, shapes))
+        vector_step = int(found or 0)
         done = vector_step * config.num_envs
         if config.total_steps < min(done, saved.config.total_steps):
             raise ValueError(
@@ -240,19 +253,50 @@ def resume(
             )
         # Before the state is allocated, or the memory check would count it twice.
         run_chunk = _compile(trainer, console)
-        if saved_any:
-            state = checkpoints.load(vector_step, _shapes(trainer))
-        else:
-            state = trainer.init(run_keys(config))
+        state = checkpoints.load(vector_step, shapes) if found else trainer.start()
         run = dataclasses.replace(saved, config=config)
-        if config != saved.config:
-            save_run(folder, run)
-        for seed_folder in seed_folders(folder, config):
-            keep_metrics(seed_folder, done)
+        on_writer(lambda: _continue_files(folder, run, saved, done))
         console.print(f"resuming after {done:,} steps")
         loop = _Loop(trainer, run, run_chunk, folder, console, stop_at, on_chunk)
         loop.run(state, vector_step // config.chunk_length)
-        return _finish(folder, run, objects, eval_episodes, console)
+        ending = _Ending(eval_episodes, console, _local_devices(trainer))
+        return _finish_on_writer(folder, run, objects, ending)
+
+
+def _own_console(console: Console | None) -> Console:
+    """The console of the process that writes; the others print nothing."""
+    if not is_writer():
+        return Console(quiet=True)
+    return make_console() if console is None else console
+
+
+def _make_folder(config: TrainConfig, folder: str | pathlib.Path | None) -> pathlib.Path:
+    if folder is None:
+        return new_run_folder(config.env.env)
+    return prepare_folder(pathlib.Path(folder))
+
+
+@contextlib.contextmanager
+def _locked(folder: pathlib.Path) -> Iterator[None]:
+    """The lock of the run folder, held by the process that writes."""
+    with contextlib.ExitStack() as stack:
+        on_writer(lambda: stack.enter_context(locked(folder)))
+        yield
+
+
+def _newest_step(
+    trainer: Trainer, folder: pathlib.Path, checkpoints: RunCheckpoints, shapes: LoopState
+) -> str:
+    """The vector step of the newest checkpoint; empty where the run did not come so far."""
+    return str(checkpoints.find_newest(shapes)) if _has_saved(trainer, folder) else ""
+
+
+def _continue_files(folder: pathlib.Path, run: SavedRun, saved: SavedRun, done: int) -> None:
+    """Brings the files of a run to the step that it continues from."""
+    if run.config != saved.config:
+        save_run(folder, run)
+    for seed_folder in seed_folders(folder, run.config):
+        keep_metrics(seed_folder, done)
 
 
 def _with_backend(config: TrainConfig, trainer: Trainer) -> TrainConfig:
@@ -289,7 +333,7 @@ def _read_policy(trainer: Trainer, path: pathlib.Path) -> Any:
     """The parameters of an agent, for each seed, to start a run from."""
     path = find_agent(path)
     tensors = read_agent(path)[1]
-    flat = flatten_params(trainer.algorithm.policy(_shapes(trainer).learner))
+    flat = flatten_params(trainer.algorithm.policy(trainer.shapes().learner))
     seeds = () if trainer.config.num_seeds == 1 else (trainer.config.num_seeds,)
     shapes = {name: x.shape[len(seeds) :] for name, x in flat.items()}
     if {name: x.shape for name, x in tensors.items()} != shapes:
@@ -326,7 +370,11 @@ def _has_saved(trainer: Trainer, folder: pathlib.Path) -> bool:
 
 
 def _prepare(
-    config: TrainConfig, objects: Objects, console: Console, scene: Scene | None = None
+    config: TrainConfig,
+    objects: Objects,
+    console: Console,
+    devices: int | None,
+    scene: Scene | None = None,
 ) -> Trainer:
     check_device()
     say_device(console)
@@ -335,27 +383,49 @@ def _prepare(
     parts = objects.given()
     if scene is not None and objects.env is None:
         parts["env"] = make_env(config.env, reward=parts.pop("reward", None), scene=scene)
-    trainer = make_trainer(config, **parts)
-    plan = memory_plan(_shapes(trainer))
+    mesh = make_mesh(_num_devices(config, objects, devices))
+    trainer = make_trainer(config, **parts, mesh=mesh)
+    if mesh is not None:
+        say_mesh(console, mesh.size, by_seed=shards_seeds(config, mesh.size))
+    plan = memory_plan(trainer.shapes())
     say_memory(console, plan)
-    check_memory(plan)
+    check_memory(plan, _local_devices(trainer))
     return trainer
 
 
-def _shapes(trainer: Trainer) -> LoopState:
-    return jax.eval_shape(trainer.init, run_keys(trainer.config))
+def _num_devices(config: TrainConfig, objects: Objects, devices: int | None) -> int:
+    """The number of local devices of a run: as asked for, or as many as divide its work."""
+    check_value("devices", Count | None, devices)
+    if devices is not None:
+        return devices
+    most = most_devices(config)
+    total = most * jax.process_count()
+    if objects.algorithm is not None and not shards_seeds(config, total):
+        # An algorithm that knows nothing of other devices trains on one, as it always did.
+        with contextlib.suppress(ValueError):
+            check_takes_shard(objects.algorithm, total)
+            return most
+        return 1
+    return most
+
+
+def _local_devices(trainer: Trainer) -> int:
+    return 1 if trainer.mesh is None else len(trainer.mesh.local_devices)
 
 
 def _compile(trainer: Trainer, console: Console) -> RunChunk:
     """The compiled chunk; refused where what it needs to work in does not fit beside the state."""
     console.print("compiling: about half a minute")
-    shapes = _shapes(trainer)
+    shapes = trainer.shapes()
     compiled = trainer.run_chunk.lower(shapes).compile()
-    simulations = trainer.config.num_seeds * trainer.config.num_envs
+    devices = 1 if trainer.mesh is None else trainer.mesh.size
+    simulations = trainer.config.num_seeds * trainer.config.num_envs // devices
     working = working_memory(compiled, trainer.env.physics, simulations)
     plan = memory_plan(shapes) | {"working": working}
     say_working_memory(console, plan)
-    check_memory(plan)
+    check_memory(plan, _local_devices(trainer))
+    # The first chunk waits for the other processes too, but not as patiently.
+    wait_for_all()
     return compiled
 
 
@@ -373,10 +443,13 @@ class _Results:
         self.folder, self.run, self.config = folder, run, run.config
         self._algorithm = trainer.algorithm
         self._evaluate = evaluate_params
-        self.best = read_selection_rate(folder / BEST)
+        read = on_writer(lambda: json.dumps(read_selection_rate(folder / BEST)))
+        self.best: float | None = json.loads(read)
         self._wall_before = last_wall_s(folder)
         self._started = started
-        self.writer = MetricsWriter(folder)
+        self.writer: contextlib.AbstractContextManager[Any] = contextlib.nullcontext()
+        if is_writer():
+            self.writer = MetricsWriter(folder)
 
     def add(
         self, counts: Counts, params: Any, chunk: int, *, seconds: float, select: bool
@@ -389,7 +462,8 @@ class _Results:
         if select:
             metrics["selection_rate"] = self._select(params, int(metrics["env_steps"]))
         metrics["wall_s"] = self._wall_before + time.perf_counter() - self._started
-        self.writer.write(metrics)
+        if isinstance(self.writer, MetricsWriter):
+            self.writer.write(metrics)
         return metrics
 
     def _select(self, params: Any, env_steps: int) -> float:
@@ -404,6 +478,8 @@ class _Results:
         self._save(LAST, params, env_steps, None)
 
     def _save(self, name: str, params: Any, env_steps: int, rate: float | None) -> None:
+        if not is_writer():
+            return
         save_agent(
             self.folder / name,
             self.config,
@@ -434,7 +510,7 @@ class _Loop:
         per_chunk = config.chunk_length * config.num_envs
         with contextlib.ExitStack() as stack:
             stack.enter_context(_offering(checkpoints))
-            interruption = stack.enter_context(_Interruption())
+            interruption = stack.enter_context(_Interruption(self.folder))
             total = config.num_chunks * per_chunk
             progress = stack.enter_context(RunProgress(self.console, total, done * per_chunk))
             results = self._results(started)
@@ -447,16 +523,14 @@ class _Loop:
                     self.on_chunk(rows, state)
                 reached = self._has_reached(results)
                 last = chunk == config.num_chunks or reached
-                if last or chunk % _SAVE_EVERY == 0 or interruption.asked:
+                asked = any_says(interruption.asked)
+                if last or chunk % _SAVE_EVERY == 0 or asked:
                     # The checkpoint last: what is older than it would not be made again.
                     for result, own in zip(results, params, strict=True):
                         result.save_last(own, chunk * per_chunk)
                     checkpoints.save(chunk * config.chunk_length, state)
-                if interruption.asked and not last:
-                    command = shlex.join(
-                        [sys.executable, "-m", "mjx_arm", "train", "--resume", str(self.folder)]
-                    )
-                    raise RunInterruptedError(f"saved; continue with: {command}")
+                if asked and not last:
+                    raise RunInterruptedError(f"saved; {_how_to_continue(self.folder)}")
                 if reached:
                     self.console.print(f"stopped: every seed has reached {self.stop_at}")
                     return
@@ -473,6 +547,7 @@ class _Loop:
             self.trainer.algorithm.apply,
             episodes=config.select_episodes,
             epsilon=_EVALUATION_EPSILON,
+            mesh=self.trainer.mesh,
         )
 
         def evaluate_params(params: Any) -> Evaluation:
@@ -497,13 +572,18 @@ class _Loop:
         config = self.trainer.config
         before = time.perf_counter()
         state, counts = self.run_chunk(state)
-        counts = jax.device_get(counts)
+        counts = fetch(counts)
         seconds = time.perf_counter() - before
         last = chunk == config.num_chunks
-        select = config.select_every > 0 and (last or _is_due(config, chunk))
+        # A policy that does not act yet has not learnt yet, and its episodes are the longest.
+        env_steps = jnp.asarray(chunk * config.chunk_length * config.num_envs)
+        acts = bool(self.trainer.algorithm.acts_on_obs(env_steps))
+        select = config.select_every > 0 and (last or (acts and _is_due(config, chunk)))
         if select:
             progress.phase(f"selecting: {config.select_episodes} episodes")
         policy = self.trainer.algorithm.policy(state.learner)
+        if self.trainer.mesh is not None:
+            policy = fetch(policy)
         params = [of_seed(policy, config, i) for i in range(len(results))]
         rows = [
             result.add(of_seed(counts, config, i), params[i], chunk, seconds=seconds, select=select)
@@ -537,11 +617,21 @@ def _is_due(config: TrainConfig, chunk: int) -> bool:
     return chunk * per_chunk // config.select_every > (chunk - 1) * per_chunk // config.select_every
 
 
-class _Interruption:
-    """Turns the first signal into a wish to stop after the chunk; the second acts as before."""
+def _how_to_continue(folder: pathlib.Path) -> str:
+    resume = ["-m", "mjx_arm", "train", "--resume", str(folder)]
+    return f"continue with: {shlex.join([sys.executable, *resume])}"
 
-    def __init__(self) -> None:
+
+class _Interruption:
+    """Turns the first signal into a wish to stop after the chunk; a second Ctrl-C acts as before.
+
+    Args:
+      folder: of the run, for what it says.
+    """
+
+    def __init__(self, folder: pathlib.Path) -> None:
         self.asked = False
+        self._folder = folder
         self._before: dict[int, Any] = {}
 
     def __enter__(self) -> Self:
@@ -565,38 +655,83 @@ class _Interruption:
         before = self._before[number]
         # Schedulers may send theirs more than once: only a second Ctrl-C means at once.
         if self.asked and number == signal.SIGINT and callable(before):
+            _say(f"steps since the newest checkpoint are lost; {_how_to_continue(self._folder)}")
             before(number, frame)
+        if not self.asked and number == signal.SIGINT:
+            _say("saving after this chunk; a second Ctrl-C ends the run at once, without saving")
         self.asked = True
+
+
+def _say(sentence: str) -> None:
+    """Prints from a signal handler, which may have interrupted another print."""
+    with contextlib.suppress(OSError):  # the terminal may be gone
+        os.write(2, f"{sentence}\n".encode(errors="replace"))
+
+
+@dataclasses.dataclass(frozen=True)
+class _Ending:
+    """What becomes of a run at its end.
+
+    Attributes:
+      eval_episodes: episodes of the evaluation.
+      console: where it prints.
+      devices: local devices that share the evaluation.
+      video: record an episode.
+    """
+
+    eval_episodes: int
+    console: Console
+    devices: int
+    video: bool = True
+
+
+def _finish_on_writer(
+    folder: pathlib.Path, run: SavedRun, objects: Objects, ending: _Ending
+) -> list[Evaluation]:
+    """What `_finish` returns, in every process."""
+    results: list[Evaluation] = []
+
+    def finish() -> str:
+        mesh = make_mesh(ending.devices, of_all=False)
+        results.extend(_finish(folder, run, objects, ending, mesh))
+        return json.dumps([dataclasses.asdict(result) for result in results])
+
+    said = on_writer(finish)
+    if results:
+        return results
+    return [Evaluation(**{**x, "ci95": tuple(x["ci95"])}) for x in json.loads(said)]
 
 
 def _finish(
     folder: pathlib.Path,
     run: SavedRun,
     objects: Objects,
-    eval_episodes: int,
-    console: Console,
-    *,
-    video: bool = True,
+    ending: _Ending,
+    mesh: jax.sharding.Mesh | None,
 ) -> list[Evaluation]:
     folders = seed_folders(folder, run.config)
     if len(folders) > 1:
         for path in plot_curves(folders, into=folder):
-            console.print(f"curves: {path}", soft_wrap=True)
-    results = [_finish_seed(own, objects, eval_episodes, console, video=video) for own in folders]
+            ending.console.print(f"curves: {path}", soft_wrap=True)
+    results = [_finish_seed(own, objects, ending, mesh) for own in folders]
     if len(folders) > 1:
         for own, config in zip(folders, seed_configs(run.config), strict=True):
             write_report(own, config, [own])
     report = write_report(folder, run.config, folders)
-    console.print(f"report: {report}", soft_wrap=True)
+    ending.console.print(f"report: {report}", soft_wrap=True)
     return results
 
 
 def _finish_seed(
-    folder: pathlib.Path, objects: Objects, eval_episodes: int, console: Console, *, video: bool
+    folder: pathlib.Path,
+    objects: Objects,
+    ending: _Ending,
+    mesh: jax.sharding.Mesh | None,
 ) -> Evaluation:
+    console = ending.console
     for path in plot_curves([folder], into=folder):
         console.print(f"curves: {path}", soft_wrap=True)
-    console.print(f"evaluating: {eval_episodes} episodes")
+    console.print(f"evaluating: {ending.eval_episodes} episodes")
     scene = None if objects.env is not None else STORED
     agent = load_agent(folder, scene=scene, **objects.given())
     console.print(f"agent: {find_agent(folder)}, after {agent.env_steps:,} steps", soft_wrap=True)
@@ -605,9 +740,10 @@ def _finish_seed(
         agent.env,
         agent.apply,
         agent.params,
-        episodes=eval_episodes,
+        episodes=ending.eval_episodes,
         epsilon=_EVALUATION_EPSILON,
         key=key,
+        mesh=mesh,
     )
     (folder / EVALUATION).write_text(json.dumps(dataclasses.asdict(result)) + "\n")
     add_evaluation(find_agent(folder), dataclasses.asdict(result))
@@ -616,7 +752,7 @@ def _finish_seed(
         f"evaluation: {result.successes} of {result.episodes} episodes succeeded, "
         f"{100 * result.rate:.1f} % (95 % interval {100 * low:.1f} to {100 * high:.1f})"
     )
-    if not video:
+    if not ending.video:
         return result
     console.print("rendering a video")
     episode = record_episode(

@@ -45,6 +45,21 @@ def test_the_cube_covers_200_square_centimetres(env, starts):
     )
 
 
+def test_starts_can_be_wider_than_those_of_environment_b_and_a_stays_constant():
+    wider = {"joint_noise_scale": 1.5, "rectangle_scale": 1.6}
+    spans = {}
+    for name in "AB":
+        env = mjx_arm.make(name, physics="native", observation="state", **wider)
+        keys = jax.random.split(jax.random.key(7), 2_000)
+        starts = jax.device_get(jax.jit(jax.vmap(lambda key, env=env: env.reset(key)[1]))(keys))
+        joints = np.rad2deg(np.ptp(starts.physics.qpos[:, env.arm.qpos], axis=0))
+        spans[name] = (joints, np.ptp(starts.placement, axis=0))
+    assert (spans["A"][0] == 0).all()
+    assert (spans["A"][1] == 0).all()
+    np.testing.assert_allclose(spans["B"][0], 60, rtol=0.05)
+    np.testing.assert_allclose(spans["B"][1], [0.16, 0.32], rtol=0.05)
+
+
 def test_few_samples_are_rejected_and_none_runs_out(starts):
     rejected = 1 - STARTS / starts.start_samples.sum()
     print(f"rejected: {100 * rejected:.1f} % of {starts.start_samples.sum()} samples")

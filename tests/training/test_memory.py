@@ -29,6 +29,14 @@ def test_a_refusal_names_the_setting_that_takes_the_most(part, setting, monkeypa
         check_memory(PLAN | {part: 3 * 10**9})
 
 
+def test_the_devices_of_a_cpu_share_its_memory(monkeypatch):
+    monkeypatch.setattr(memory, "free_memory", lambda: 2 * 10**9)
+    plan = PLAN | {"replay": 6 * 10**8}
+    check_memory(plan, devices=3)
+    with pytest.raises(ValueError, match=r"replay 2\.40 GB, and 2\.00 GB are free"):
+        check_memory(plan, devices=4)
+
+
 def write(root: pathlib.Path, group: str, **files: str) -> None:
     (root / group).mkdir(parents=True, exist_ok=True)
     for name, text in files.items():

@@ -1,13 +1,16 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import importlib
+import subprocess
 import sys
 
 import pytest
 
 from mjx_arm.config import train_config
-from mjx_arm.training.objects import Objects, check_record, record
+from mjx_arm.references import reference_to
+from mjx_arm.training.objects import Objects, check_record, only_here, record
 
 MODULE = """
 import flax.linen as nn
@@ -27,6 +30,24 @@ class Net(nn.Module):
     @nn.compact
     def __call__(self, obs):
         return nn.Dense(self.num_actions)(obs)
+"""
+
+SCRIPT = """
+if __name__ == "__main__":
+    import json
+    import pathlib
+    import sys
+
+    from mjx_arm.config import train_config
+    from mjx_arm.training.objects import Objects, check_record, only_here, record
+
+    file, objects = pathlib.Path(sys.argv[1]), Objects(network=Net())
+    if not file.exists():
+        file.write_text(json.dumps(record(train_config(), objects)))
+    recorded = json.loads(file.read_text())
+    assert only_here(recorded) == []
+    check_record(recorded, train_config(), objects, str(file))
+    print(recorded["network"]["given"])
 """
 
 
@@ -102,18 +123,41 @@ def test_what_a_configuration_names_is_recorded_and_checked(own, tmp_path):
         check_record(found, config, Objects(), "here")
 
 
-def test_what_no_other_process_can_import_is_refused(own):
+def make_local():
     def local(before, after, action):
         return {}
 
-    for value in (lambda before, after, action: {}, local):
-        with pytest.raises(ValueError, match=r"reward is .* which no other process can import"):
-            record(train_config(), Objects(reward=value))
+    return local
 
 
-def test_what_has_no_source_is_refused():
-    with pytest.raises(ValueError, match=r"the source of 'builtins:.*' is not in a file"):
-        record(train_config(), Objects(reward=sum))
+@pytest.mark.parametrize(
+    "value",
+    [lambda before, after, action: {}, make_local(), sum, functools.partial(max, 1)],
+    ids=["lambda", "function in a function", "no source", "partial"],
+)
+def test_what_no_other_process_can_have_counts_in_this_one_alone(value):
+    config = train_config()
+    found = record(config, Objects(reward=value))
+    (sentence,) = only_here(found)
+    assert sentence.startswith(f"reward is {reference_to(value)}, which no other process can have")
+    check_record(found, config, Objects(reward=value), "here")
+    for objects in (Objects(), Objects(reward=lambda before, after, action: {})):
+        with pytest.raises(ValueError, match=r"here was made with reward=.* which only"):
+            check_record(found, config, objects, "here")
+    found["reward"]["only_in"] = "the token of another process"
+    with pytest.raises(ValueError, match="which only the process that made it had"):
+        check_record(found, config, Objects(reward=value), "here")
+
+
+def test_what_a_script_defines_can_be_passed_again_by_the_same_script(tmp_path):
+    script = tmp_path / "script.py"
+    script.write_text(MODULE + SCRIPT)
+    for _ in range(2):  # the second time as a process of its own, with the record of the first
+        done = subprocess.run(
+            [sys.executable, script, tmp_path / "record.json"], capture_output=True, text=True
+        )
+        assert (done.returncode, done.stderr) == (0, "")
+        assert done.stdout == "__main__:Net\n"
 
 
 def test_only_what_was_given_counts(own):

@@ -134,17 +134,21 @@ def test_a_run_is_continued_elsewhere_and_saves_when_a_scheduler_asks(copy, monk
 
 
 @pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP", "SIGUSR1"])
-def test_a_signal_asks_to_stop(name):
+def test_a_signal_asks_to_stop(name, tmp_path, capfd):
     number = getattr(signal, name)
     before = signal.signal(number, signal.default_int_handler)
     try:
-        with _Interruption() as interruption:
+        with _Interruption(tmp_path) as interruption:
             assert not interruption.asked
             signal.raise_signal(number)
             assert interruption.asked
             if name == "SIGINT":
                 with pytest.raises(KeyboardInterrupt):
                     signal.raise_signal(number)
+                first, second = capfd.readouterr().err.splitlines()
+                assert first.startswith("saving after this chunk; a second Ctrl-C ends the run")
+                assert second.startswith("steps since the newest checkpoint are lost; continue")
+                assert second.endswith(f"train --resume {tmp_path}")
             else:
                 signal.raise_signal(number)  # schedulers may send theirs more than once
         assert signal.getsignal(number) == signal.default_int_handler
@@ -152,10 +156,10 @@ def test_a_signal_asks_to_stop(name):
         signal.signal(number, before)
 
 
-def test_a_hangup_that_is_ignored_stays_ignored():
+def test_a_hangup_that_is_ignored_stays_ignored(tmp_path):
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
-        with _Interruption() as interruption:
+        with _Interruption(tmp_path) as interruption:
             signal.raise_signal(signal.SIGHUP)
             assert not interruption.asked
     finally:

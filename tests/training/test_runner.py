@@ -12,7 +12,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jax.experimental.compilation_cache.compilation_cache import reset_cache
 from rich.console import Console
 
 import mjx_arm
@@ -98,21 +97,14 @@ def evaluate_nothing(env, apply, params, *, episodes, **options):
 
 
 @pytest.fixture(autouse=True, scope="module")
-def quick_runs(tmp_path_factory):
-    """Without what the tests of the command line look at; a program is compiled only once."""
-    cache = tmp_path_factory.mktemp("cache")
+def quick_runs():
+    """Without what the tests of the command line look at."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(runner, "record_episode", record_nothing)
         patch.setattr(runner, "draw_episode", lambda env, episode: iter(()))
         patch.setattr(runner, "write_video", lambda path, frames: None)
         patch.setattr(runner, "evaluate", evaluate_nothing)
-        jax.config.update("jax_compilation_cache_dir", str(cache))
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
-        reset_cache()
         yield
-        jax.config.update("jax_compilation_cache_dir", None)
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 1.0)
-        reset_cache()
 
 
 def train(folder: pathlib.Path, config=CONFIG, **options):

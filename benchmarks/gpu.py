@@ -1,0 +1,402 @@
+"""What a GPU does, in one command of under 9 minutes; every result is written at once.
+
+    python benchmarks/gpu.py --json DIR                     # the cells of one visit, in their order
+    python benchmarks/gpu.py --json DIR --only b            # then environment B, 8 minutes
+    python benchmarks/gpu.py --json DIR --only published    # then settings that others published
+    JAX_PLATFORMS=cpu python benchmarks/gpu.py --store      # the CPU's values that parity needs
+
+A cell is one figure. Cells with fewer figures come first, so that none is measured twice before
+each is measured once; a repeated command appends. It needs neither a network nor orbax,
+imageio-ffmpeg, tensorboardX, gymnasium and matplotlib; `wheels.py` fetches the rest. `--tiny`
+rehearses it on a CPU.
+"""
+
+from __future__ import annotations
+
+import argparse
+import base64
+import contextlib
+import dataclasses
+import functools
+import importlib.util
+import json
+import pathlib
+import time
+import zlib
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import jax
+import numpy as np
+from machine import machine
+from throughput import compile_training, env_stages, peak_memory, time_stage, time_training
+
+import mjx_arm
+from mjx_arm.config import TrainConfig, set_train_options
+from mjx_arm.physics import compiler_options
+from mjx_arm.training.evaluate import make_evaluator
+from mjx_arm.training.loop import SELECTION, make_trainer, role_key
+
+STORED = pathlib.Path(__file__).parent / "results" / "gpu-parity.json"
+# Of the evaluations that say how far a training is; `train` selects by the same.
+_SEED, _EPSILON = 2_000_003, 0.1
+# Poses whose images are compared, and iterations of the motion that is.
+_POSES, _ITERATIONS = 8, 20
+_TINY: dict[str, Any] = {
+    "num_envs": 4,
+    "size": (16, 16),
+    "replay_size": 400,
+    "learning_starts": 40,
+    "chunk_steps": 80,
+    "max_steps": 15,
+    "widths": (4, 4, 4),
+    "hidden": 16,
+    "teacher_hidden": 16,
+    "teacher_batch_size": 16,
+    "student_batch_size": 8,
+    "student_starts": 80,
+    "select_every": 160,
+    "select_episodes": 4,
+}
+
+Row = dict[str, Any]
+Write = Callable[[Row], None]
+
+
+@dataclasses.dataclass(frozen=True)
+class Visit:
+    """What a cell needs to know.
+
+    Attributes:
+      tiny: whether this is a rehearsal at sizes that mean nothing.
+      deadline: when the command must be done, by `time.monotonic`.
+    """
+
+    tiny: bool
+    deadline: float
+
+    def left(self) -> float:
+        """Seconds that are left."""
+        return self.deadline - time.monotonic()
+
+    def config(self, **options: Any) -> TrainConfig:
+        """The preset `gpu` with options changed, or the same of a rehearsal."""
+        config = set_train_options(mjx_arm.PRESETS["gpu"], options)
+        if not self.tiny:
+            return config
+        kept = {name: x for name, x in options.items() if name in ("env", "physics", "convolution")}
+        return set_train_options(mjx_arm.PRESETS["gpu"], _TINY | kept)
+
+
+@dataclasses.dataclass(frozen=True)
+class Cell:
+    """One figure.
+
+    Attributes:
+      name: what it is called in its file.
+      file: the name of its file, without its ending.
+      measure: takes the visit, and a function that writes what is known so far.
+      seconds: the least time that it needs; with less it is not begun.
+    """
+
+    name: str
+    file: str
+    measure: Callable[[Visit, Write], None]
+    seconds: float
+
+
+def device(visit: Visit, write: Write) -> None:
+    """Versions and device."""
+    del visit
+    one = jax.devices()[0]
+    write({"devices": jax.device_count(), "memory": one.memory_stats() or {}})
+
+
+def parity(visit: Visit, write: Write) -> None:
+    """Renderer and physics here beside the stored values of the CPU."""
+    stored, now = json.loads(STORED.read_text()), compute(visit)
+    images, expected = _decode(now["images"]), _decode(stored["images"])
+    same = np.asarray(mjx_arm.segmentation(images)) == np.asarray(mjx_arm.segmentation(expected))
+    colours = np.abs(np.asarray(mjx_arm.rgb(images), int) - np.asarray(mjx_arm.rgb(expected), int))[
+        same
+    ]
+    gap = np.abs(np.asarray(now["qpos"]) - np.asarray(stored["qpos"])).max(axis=(1, 2))
+    write(
+        {
+            "stored_on": stored["machine"],
+            "share_of_pixels_of_another_geom": float(1 - same.mean()),
+            "largest_difference_of_colour": int(colours.max(initial=0)),
+            "backends": [stored["backend"], now["backend"]],
+            "largest_difference_of_qpos": float(gap.max()),
+            "by_iteration": gap.tolist(),
+        }
+    )
+
+
+def compute(visit: Visit) -> Row:
+    """Images of some starts in B, and a motion of the arm through the air from the same starts."""
+    del visit
+    env = mjx_arm.make("B", observation="packed", physics="auto")
+    keys = jax.random.split(jax.random.key(11), _POSES)
+    flags = compiler_options(env.physics)
+    obs, state = jax.jit(jax.vmap(env.reset), compiler_options=flags)(keys)
+    actions = jax.random.randint(jax.random.key(12), (_ITERATIONS, _POSES), 0, 6)
+
+    def step(state: Any, action: jax.Array) -> tuple[Any, jax.Array]:
+        state = jax.vmap(env.transition)(state, action)[0]
+        return state, state.physics.qpos
+
+    run = jax.jit(lambda state: jax.lax.scan(step, state, actions)[1], compiler_options=flags)
+    images = base64.b64encode(zlib.compress(np.asarray(obs).tobytes(), 9)).decode()
+    return {
+        "backend": env.physics.backend,
+        "images": {"shape": list(obs.shape), "data": images},
+        "qpos": np.asarray(run(state), float).round(7).tolist(),
+    }
+
+
+def _decode(images: Row) -> np.ndarray:
+    data = zlib.decompress(base64.b64decode(images["data"]))
+    return np.frombuffer(data, np.uint32).reshape(images["shape"])
+
+
+def train(visit: Visit, write: Write, *, env: str, goal: float, minutes: float) -> None:
+    """Trains with the preset `gpu` until the goal or the end of the time; a row each selection."""
+    config = visit.config(env=env)
+    trainer = make_trainer(config)
+    started = time.perf_counter()
+    run = trainer.run_chunk.lower(trainer.shapes()).compile()
+    judge = make_evaluator(
+        trainer.env, trainer.algorithm.apply, episodes=config.select_episodes, epsilon=_EPSILON
+    )
+    state = trainer.start()
+    key = role_key(_SEED, SELECTION)
+    # The first of both is no part of the training: compiled and thrown away.
+    judge(trainer.algorithm.policy(state.learner), key)
+    row: Row = {
+        "env": env,
+        "goal": goal,
+        "compile_s": round(time.perf_counter() - started, 1),
+        "samples_per_step": config.samples_per_step,
+        "judged": [],
+        "reached": None,
+    }
+    write(row)
+    end = time.monotonic() + min(60 * minutes, visit.left())
+    per_chunk = config.chunk_length * config.num_envs
+    started = time.perf_counter()
+    for chunk in range(1, config.num_chunks + 1):
+        state, counts = run(state)
+        counts = jax.device_get(counts)
+        late = time.monotonic() > end
+        due = chunk * per_chunk // config.select_every
+        if due > (chunk - 1) * per_chunk // config.select_every or late:
+            trained = time.perf_counter() - started
+            result = judge(trainer.algorithm.policy(state.learner), key)
+            steps = chunk * per_chunk
+            row["judged"].append(
+                {
+                    "minutes": round((time.perf_counter() - started) / 60, 3),
+                    "env_steps": steps,
+                    "steps_per_s": round(steps / trained),
+                    "rate": result.rate,
+                    "ci95": result.ci95,
+                    "episodes": result.episodes,
+                    "training_rate": float(counts["successes"] / max(counts["episodes"], 1)),
+                }
+            )
+            if result.rate >= goal:
+                row["reached"] = row["judged"][-1]
+            write(row)
+        if late or row["reached"] or (visit.tiny and len(row["judged"]) == 2):
+            return
+
+
+def _length(config: TrainConfig, visit: Visit) -> int:
+    return 2 if visit.tiny else max(8, 131_072 // config.num_envs)
+
+
+def environment(
+    visit: Visit,
+    write: Write,
+    *,
+    num_envs: int,
+    stage: str = "physics+render",
+    physics: str = "auto",
+    fence: bool = False,
+    size: int = 64,
+) -> None:
+    """A stage of the environment alone; `fence` computes an image before what reads it."""
+    if physics == "mjx-warp" and importlib.util.find_spec("warp") is None:
+        write({"left_out": "warp-lang is not installed"})
+        return
+    num_envs, size = (4, 16) if visit.tiny else (num_envs, size)
+    env = mjx_arm.make("B", physics=physics, observation="packed", size=(size, size))
+    flags = compiler_options(env.physics)
+    reset = jax.jit(jax.vmap(mjx_arm.AutoReset(env).reset), compiler_options=flags)
+    obs, state = reset(jax.random.split(jax.random.key(0), num_envs))
+    length = 2 if visit.tiny else max(8, 131_072 // num_envs)
+    if fence:
+        env = _Fenced(**{field.name: getattr(env, field.name) for field in dataclasses.fields(env)})
+    run = env_stages(env, num_envs, length)[stage]
+    figures = time_stage(run, (state, obs), num_envs * length, 3, flags)
+    write({"num_envs": num_envs, "size": size, "backend": env.physics.backend, **figures})
+
+
+class _Fenced(mjx_arm.Env):
+    """An environment whose image is computed before anything that reads it."""
+
+    def observe(self, state: mjx_arm.EnvState) -> Any:
+        """What `Env.observe` returns."""
+        return jax.lax.optimization_barrier(super().observe(state))
+
+
+def training(
+    visit: Visit, write: Write, *, num_envs: int, precision: str = "", **options: Any
+) -> None:
+    """The whole loop once it learns, and its memory beside the plan."""
+    base = {"student_starts": 0, "learning_starts": 0} if "algorithm" not in options else {}
+    config = visit.config(num_envs=num_envs, **(base | options))
+    config = set_train_options(config, {"chunk_steps": _length(config, visit) * config.num_envs})
+    with jax.default_matmul_precision(precision) if precision else contextlib.nullcontext():
+        compiled = compile_training(config)
+        figures = time_training(compiled, 1 if visit.tiny else 3)
+    row = {"num_envs": config.num_envs, "options": options, **figures}
+    # Written before the memory is looked at, which takes as long again.
+    write(row)
+    write(row | peak_memory(compiled))
+
+
+def _cells() -> dict[str, list[Cell]]:
+    """The cells of each command, in their order."""
+    part = functools.partial
+    first = [
+        Cell("device", "device", device, 1),
+        Cell("parity", "parity", parity, 20),
+        Cell("a", "train-a", part(train, env="A", goal=0.95, minutes=4.0), 60),
+    ]
+    for num_envs in (8_192, 1_024):
+        first += [
+            Cell(
+                f"physics+render at {num_envs}",
+                "throughput",
+                part(environment, num_envs=num_envs),
+                30,
+            ),
+            Cell(f"training at {num_envs}", "throughput", part(training, num_envs=num_envs), 45),
+        ]
+    many = 8_192
+    for convolution in ("nn.Conv", "patches"):
+        measure = part(training, num_envs=many, convolution=convolution)
+        first.append(Cell(f"convolution {convolution}", "comparisons", measure, 45))
+    for precision in ("highest", "default"):
+        measure = part(training, num_envs=many, precision=precision)
+        first.append(Cell(f"precision {precision}", "comparisons", measure, 45))
+    for name, fence in (("fused", False), ("fenced", True)):
+        measure = part(environment, num_envs=many, fence=fence)
+        first.append(Cell(f"ray cast {name}", "comparisons", measure, 30))
+    for physics in ("mjx", "mjx-warp"):
+        measure = part(environment, num_envs=many, stage="physics", physics=physics)
+        first.append(Cell(f"physics {physics}", "comparisons", measure, 30))
+    # Squint (arXiv 2602.21203): 1,024 environments, images of 16 by 16, a replay of 1 M and 256
+    # updates of 512 in each 1,024 steps, discount 0.9. Theirs is SAC; ours is DQN.
+    squint = {
+        "algorithm": "dqn",
+        "size": (16, 16),
+        "replay_size": 1_048_576,
+        "storage": "pixels",
+        "batch_size": 512,
+        "updates_per_step": 256,
+        "gamma": 0.9,
+        "learning_starts": 0,
+    }
+    published = [
+        # Playground's PandaPickCubeCartesian: 1,024 environments of 64 by 64 pixels.
+        Cell("playground", "published", part(environment, num_envs=1_024), 30),
+        Cell(
+            "playground, physics",
+            "published",
+            part(environment, num_envs=1_024, stage="physics"),
+            30,
+        ),
+        Cell("squint", "published", part(training, num_envs=1_024, **squint), 60),
+    ]
+    b = [Cell("b", "train-b", part(train, env="B", goal=1.1, minutes=8.0), 60)]
+    return {"": first, "b": b, "published": published}
+
+
+CELLS = _cells()
+
+
+def read(folder: pathlib.Path, file: str) -> list[Row]:
+    """The rows of a file of results."""
+    path = folder / f"{file}.json"
+    return json.loads(path.read_text())["rows"] if path.is_file() else []
+
+
+def append(folder: pathlib.Path, cell: Cell) -> Write:
+    """A function that writes a new row of a cell, and writes it again when it is called again."""
+    before = read(folder, cell.file)
+    about = {"cell": cell.name, "machine": machine(), "at": time.strftime("%Y-%m-%d %H:%M:%S")}
+
+    def write(row: Row) -> None:
+        rows = [*before, about | row]
+        folder.mkdir(parents=True, exist_ok=True)
+        part = folder / f"{cell.file}.part"
+        part.write_text(json.dumps({"rows": rows}, indent=1) + "\n")
+        part.replace(folder / f"{cell.file}.json")
+
+    return write
+
+
+def in_order(folder: pathlib.Path, cells: list[Cell]) -> Iterator[Cell]:
+    """The cells, those with the fewest figures first."""
+    figures = {
+        cell.name: sum(row["cell"] == cell.name for row in read(folder, cell.file))
+        for cell in cells
+    }
+    # Python's sort keeps the order of equal ones.
+    yield from sorted(cells, key=lambda cell: figures[cell.name])
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Measures the cells of a command until its time is over."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--json", type=pathlib.Path, help="folder for the results")
+    parser.add_argument("--only", choices=[name for name in CELLS if name], default="")
+    parser.add_argument("--cells", nargs="+", help="some of the command's cells, by name")
+    parser.add_argument("--minutes", type=float, default=8.5, help="begin and train no longer")
+    parser.add_argument("--tiny", action="store_true", help="rehearse at sizes that mean nothing")
+    parser.add_argument("--store", action="store_true", help=f"write {STORED.name} from a CPU")
+    options = parser.parse_args(arguments)
+    visit = Visit(options.tiny, time.monotonic() + 60 * options.minutes)
+    if options.store:
+        if jax.default_backend() != "cpu":
+            parser.error("--store keeps the values of a CPU: set JAX_PLATFORMS=cpu")
+        STORED.write_text(json.dumps({"machine": machine(), **compute(visit)}) + "\n")
+        return
+    if options.json is None:
+        parser.error("--json must be a folder for the results, got none")
+    cells = CELLS[options.only]
+    if options.cells:
+        unknown = set(options.cells) - {cell.name for cell in cells}
+        if unknown:
+            parser.error(
+                f"--cells must be some of {[x.name for x in cells]}, got {sorted(unknown)}"
+            )
+        cells = [cell for cell in cells if cell.name in options.cells]
+    for cell in in_order(options.json, cells):
+        if visit.left() < cell.seconds:
+            print(f"{cell.name}: left out, {visit.left():.0f} s are left", flush=True)
+            continue
+        started, write = time.monotonic(), append(options.json, cell)
+        try:
+            cell.measure(visit, write)
+        except (jax.errors.JaxRuntimeError, ValueError) as error:
+            # One cell that does not fit the device must not cost the others.
+            write({"failed": " ".join(str(error).split())[:300]})
+        print(f"{cell.name}: {time.monotonic() - started:.0f} s", flush=True)
+
+
+if __name__ == "__main__":
+    main()

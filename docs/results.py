@@ -1,0 +1,189 @@
+"""The tables of the page of benchmarks, made from the files in `benchmarks/results`.
+
+As an extension of Sphinx this adds the directive `results`, whose argument names a table.
+"""
+
+from __future__ import annotations
+
+import json
+import pathlib
+import statistics
+from collections.abc import Callable, Sequence
+from typing import Any
+
+RESULTS = pathlib.Path(__file__).parents[1] / "benchmarks" / "results"
+
+
+def render(name: str, folder: pathlib.Path = RESULTS) -> str:
+    """A table in Markdown, with the machine and the file below it.
+
+    Args:
+      name: of the table, one of `TABLES`.
+      folder: with the files.
+
+    Raises:
+      ValueError: there is no such table.
+    """
+    if name not in TABLES:
+        raise ValueError(f"results must name one of {', '.join(TABLES)}, got {name!r}")
+    file, make = TABLES[name]
+    content = json.loads((folder / file).read_text(encoding="utf-8"))
+    header, rows = make(content)
+    lines = [header, ["---"] * len(header), *rows]
+    table = "\n".join(f"| {' | '.join(str(x) for x in line)} |" for line in lines)
+    return f"{table}\n\n{_machine(content)} File: `benchmarks/results/{file}`."
+
+
+Table = tuple[list[str], list[list[str]]]
+
+
+def _throughput(content: Any) -> Table:
+    columns = {
+        "physics": ("physics", False),
+        "rendering": ("render", False),
+        "both": ("physics+render", False),
+        "rendering, shadows": ("render", True),
+        "both, shadows": ("physics+render", True),
+    }
+    rates = {
+        (row["num_envs"], row["stage"], row["shadows"]): row["steps_per_s"]
+        for row in content["rows"]
+    }
+    measured = {key[1:] for key in rates}
+    columns = {name: column for name, column in columns.items() if column in measured}
+    return (
+        ["environments", *(f"{name}, steps/s" for name in columns)],
+        [
+            [f"{n:,}", *(_number(rates.get((n, *column))) for column in columns.values())]
+            for n in _sizes(content)
+        ],
+    )
+
+
+def _train(content: Any) -> Table:
+    cells = {(r["num_envs"], r["stage"], r["storage"]): r for r in content["rows"]}
+    header = ["environments", "acting, steps/s", "updates of 64 per s"]
+    for storage in ("states", "pixels"):
+        header += [f"training, replay of {storage}, steps/s", "memory, MB"]
+    rows = []
+    for n in _sizes(content):
+        row = [f"{n:,}", *(_number(cells[n, x, "states"]["steps_per_s"]) for x in ("act", "learn"))]
+        for storage in ("states", "pixels"):
+            cell = cells[n, "train", storage]
+            row += [_number(cell["steps_per_s"]), _number(cell["peak_bytes"] / 1e6)]
+        rows.append(row)
+    return header, rows
+
+
+def _peers(content: Any) -> Table:
+    kinds = {
+        "env": "environment steps",
+        "act": "observations acted on",
+        "update": "updates of 64",
+        "train": "environment steps, trained",
+    }
+    rows = []
+    for name, rounds in content["per_second"].items():
+        kind, what = name.split("/", 1)
+        span = f"{_number(min(rounds))} to {_number(max(rounds))}"
+        rows.append([what, kinds[kind], _number(statistics.median(rounds)), span])
+    return ["what", "counted", "per second, median", "all rounds"], rows
+
+
+def _peer_ratios(content: Any) -> Table:
+    rows = [[name.replace(" / ", " against "), f"{x:.2f}"] for name, x in _ratios(content)]
+    return ["pair", "median of the ratios"], rows
+
+
+def _ratios(content: Any) -> list[tuple[str, float]]:
+    return list(content["median_ratios"].items())
+
+
+def _profile(content: Any) -> Table:
+    rows = [[r["stage"], f"{r['ms']:.1f}", f"{r['floor_ms']:.1f}"] for r in content["rows"]]
+    return ["stage", "ms", "least possible, ms"], rows
+
+
+def _overhead(content: Any) -> Table:
+    rows = [
+        [f"{r['num_envs']:,}", *(_number(r["median"][x]) for x in ("native", "loop"))]
+        for r in content["rows"]
+    ]
+    return ["environments", "`native` in a scan, steps/s", "loop of `mujoco.batch`, steps/s"], rows
+
+
+def _seconds(content: Any) -> Table:
+    rows = [
+        [name, f"{x:.1f}", ", ".join(f"{each:.1f}" for each in content["all"][name])]
+        for name, x in content["median"].items()
+    ]
+    return ["start", "median, s", "each, s"], rows
+
+
+def _time_to_success(content: Any) -> Table:
+    rows = []
+    for result in content["results"]:
+        last = result["judged"][-1]
+        reached = "yes" if result["reached"] else "no"
+        rows.append(
+            [
+                result["learner"],
+                reached,
+                f"{last['minutes']:.0f}",
+                f"{last['env_steps']:,}",
+                f"{100 * last['rate']:.0f} %",
+                f"{result['machine']['cpu']}, threads: {result['machine']['threads']}",
+            ]
+        )
+    goal = f"reached {100 * content['goal']:.0f} %"
+    return ["learner", goal, "minutes", "steps", "success then", "machine"], rows
+
+
+def _sizes(content: Any) -> list[int]:
+    return sorted({row["num_envs"] for row in content["rows"]})
+
+
+def _number(value: float | None) -> str:
+    return "not measured" if value is None else f"{value:,.0f}"
+
+
+def _machine(content: Any) -> str:
+    machine = content.get("machine")
+    if machine is None:
+        return ""
+    versions = ", ".join(f"{x} {machine[x]}" for x in ("jax", "mujoco", "torch") if x in machine)
+    return f"Machine: {machine['cpu']}, {machine['cores']} cores, {versions}."
+
+
+TABLES: dict[str, tuple[str, Callable[[Any], Table]]] = {
+    "throughput": ("throughput.json", _throughput),
+    "throughput-mjx": ("throughput_mjx.json", _throughput),
+    "train": ("throughput_train.json", _train),
+    "peers": ("peers.json", _peers),
+    "peer-ratios": ("peers.json", _peer_ratios),
+    "profile": ("profile.json", _profile),
+    "overhead": ("native_overhead.json", _overhead),
+    "cold-start": ("cold_start.json", _seconds),
+    "smoke": ("smoke.json", _seconds),
+    "time-to-success": ("time_to_success_2_cores.json", _time_to_success),
+    "time-to-success-1": ("time_to_success.json", _time_to_success),
+}
+
+
+def setup(app: Any) -> dict[str, bool]:
+    """Adds the directive to Sphinx."""
+    from docutils import nodes
+    from sphinx.util.docutils import SphinxDirective
+
+    class Results(SphinxDirective):
+        """A table by its name."""
+
+        required_arguments = 1
+
+        def run(self) -> Sequence[nodes.Node]:
+            name = self.arguments[0]
+            self.env.note_dependency(str(RESULTS / TABLES[name][0]))
+            return self.parse_text_to_nodes(render(name))
+
+    app.add_directive("results", Results)
+    return {"parallel_read_safe": True, "parallel_write_safe": True}

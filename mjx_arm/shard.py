@@ -1,0 +1,66 @@
+"""The part of one device in work that several devices share along an axis of a mesh."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import TypeVar
+
+import jax
+import jax.numpy as jnp
+
+T = TypeVar("T")
+
+
+@dataclasses.dataclass(frozen=True)
+class Shard:
+    """One of the equal parts of a computation inside `jax.shard_map`; by default the whole.
+
+    For the whole each function returns its argument, so a program for one device has no trace of
+    them.
+
+    Attributes:
+      axis: name of the mesh axis, or None for the whole.
+      count: number of parts, which is the size of the axis.
+    """
+
+    axis: str | None = None
+    count: int = 1
+
+    def part(self, rows: int) -> int:
+        """Rows of each part, of a number of rows that `count` divides."""
+        return rows // self.count
+
+    def fold(self, key: jax.Array) -> jax.Array:
+        """A key of this part, from one that all parts share. Consumes the key."""
+        if self.axis is None:
+            return key
+        return jax.random.fold_in(key, jax.lax.axis_index(self.axis))
+
+    def own(self, rows: jax.Array) -> jax.Array:
+        """The rows of this part, `[N / count, ...]`, of `[N, ...]` that every part knows."""
+        if self.axis is None:
+            return rows
+        size = self.part(len(rows))
+        return jax.lax.dynamic_slice_in_dim(rows, jax.lax.axis_index(self.axis) * size, size)
+
+    def mean(self, tree: T) -> T:
+        """The mean over the parts of each array of a tree."""
+        return tree if self.axis is None else jax.lax.pmean(tree, self.axis)
+
+    def total(self, tree: T) -> T:
+        """The sum over the parts of each array of a tree."""
+        return tree if self.axis is None else jax.lax.psum(tree, self.axis)
+
+    def largest(self, tree: T) -> T:
+        """The maximum over the parts of each array of a tree."""
+        return tree if self.axis is None else jax.lax.pmax(tree, self.axis)
+
+    def keep_first(self, tree: T) -> T:
+        """The tree on the first part and zeros on the others: `total` gives it back."""
+        if self.axis is None:
+            return tree
+        first = jax.lax.axis_index(self.axis) == 0
+        return jax.tree.map(lambda x: jnp.where(first, x, jnp.zeros_like(x)), tree)
+
+
+WHOLE = Shard()

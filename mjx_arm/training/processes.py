@@ -1,0 +1,231 @@
+"""Several processes that train one run together: how they meet, who writes, what they agree on.
+
+They meet by `jax.distributed`. Each process calls the functions of this module in the same order.
+With one process each function does without the others.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import itertools
+import os
+import sys
+import threading
+import time
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import jax
+import numpy as np
+from jax.experimental import multihost_utils
+
+# The processes meet so often, and one that does not come for so long is lost, seconds.
+_PERIOD, _SILENCE = 5, 30
+# jax ends a process with a page of its own when another is silent for so long, seconds.
+_HEARTBEAT = 100
+# The others wait for so long until a process has started, and until it ends, seconds.
+_START, _END = 300, 30
+# Process 0 evaluates, renders and writes while the others wait, ms.
+_PATIENCE = 24 * 60 * 60 * 1000
+# Bytes of a text that process 0 tells the others.
+_TEXT = 65_536
+_barriers = itertools.count()
+_ending = threading.Event()
+
+
+def join_processes(
+    coordinator: str | None = None, num_processes: int | None = None, process_id: int | None = None
+) -> None:
+    """Makes this process one of several, as the options or the environment say.
+
+    Without options that is where Slurm, Open MPI or Kubernetes report more than one process, which
+    jax detects. Must come before anything that asks jax for its devices.
+
+    Args:
+      coordinator: `HOST:PORT` of process 0, the same in every process.
+      num_processes: number of processes; 1 for this one alone, whatever the environment says.
+      process_id: number of this process, from 0.
+
+    Raises:
+      ValueError: the options are incomplete or invalid, or the processes did not meet.
+    """
+    if num_processes == 1 or jax.distributed.is_initialized():
+        return
+    given = (coordinator, num_processes, process_id)
+    if all(value is None for value in given):
+        if detects_processes(os.environ):
+            _initialize()
+        return
+    if coordinator is None or num_processes is None or process_id is None:
+        raise ValueError(
+            "--coordinator, --num-processes and --process-id go together: give all three or none"
+        )
+    host, _, port = coordinator.rpartition(":")
+    if not host or not port.isdigit() or not 0 < int(port) < 2**16:
+        raise ValueError(f"--coordinator must be HOST:PORT, got {coordinator!r}")
+    if num_processes < 1:
+        raise ValueError(f"--num-processes must be at least 1, got {num_processes}")
+    if not 0 <= process_id < num_processes:
+        raise ValueError(f"--process-id must be from 0 to {num_processes - 1}, got {process_id}")
+    _initialize(
+        coordinator_address=coordinator,
+        num_processes=num_processes,
+        process_id=process_id,
+        cluster_detection_method="deactivate",
+    )
+
+
+def detects_processes(environ: Mapping[str, str]) -> bool:
+    """Whether a launcher that jax knows reports more than one process.
+
+    A shell inside of a job is one process: Slurm then says that its step has one task.
+
+    Args:
+      environ: the environment variables.
+    """
+    if {"SLURM_JOB_ID", "SLURM_STEP_NODELIST", "SLURM_PROCID", "SLURM_LOCALID"} <= set(environ):
+        tasks = environ.get("SLURM_STEP_NUM_TASKS", environ.get("SLURM_NTASKS", "1"))
+        return int(tasks) > 1
+    if "OMPI_MCA_orte_hnp_uri" in environ:
+        return int(environ.get("OMPI_COMM_WORLD_SIZE", "1")) > 1
+    # Only Kubernetes itself knows how many pods a job has; jax asks it through this package.
+    indexed = {"KUBERNETES_SERVICE_HOST", "JOB_COMPLETION_INDEX"} <= set(environ)
+    return indexed and importlib.util.find_spec("kubernetes") is not None
+
+
+def _initialize(**options: Any) -> None:
+    # Its handler of SIGTERM would take the place of ours, which saves at the end of a chunk.
+    jax.config.update("jax_enable_preemption_service", False)
+    try:
+        jax.distributed.initialize(
+            **options,
+            initialization_timeout=_START,
+            heartbeat_timeout_seconds=_HEARTBEAT,
+            shutdown_timeout_seconds=_END,
+        )
+    except Exception as error:
+        reason = " ".join(str(error).split())[:200]
+        raise ValueError(
+            f"the processes did not meet: {reason}; check --coordinator, or give --num-processes 1 "
+            "to train in this process alone"
+        ) from error
+
+
+def is_writer() -> bool:
+    """Whether this process writes the files and the progress of the run."""
+    return alone() or jax.process_index() == 0
+
+
+def alone() -> bool:
+    """Whether this process trains its runs alone. Does not ask jax for its devices."""
+    return not jax.distributed.is_initialized() or jax.process_count() == 1
+
+
+def any_says(flag: bool) -> bool:
+    """Whether the flag is set in any process; the same answer in all of them."""
+    if alone():
+        return flag
+    return bool(multihost_utils.process_allgather(np.array(flag)).any())
+
+
+def on_writer(function: Callable[[], str | None]) -> str:
+    """Runs a function in process 0 alone, while the others wait.
+
+    Args:
+      function: returns a short text, or None for an empty one.
+
+    Returns:
+      The text, in every process.
+
+    Raises:
+      ValueError: the function raised it; the same sentence in every process.
+    """
+    if alone():
+        return function() or ""
+    text, failed = "", False
+    if is_writer():
+        try:
+            text = function() or ""
+        except ValueError as error:
+            text, failed = str(error), True
+    # A collective gives up after half a minute; a barrier waits.
+    wait_for_all()
+    content = text.encode()[:_TEXT]
+    buffer = np.zeros(_TEXT + 8, np.uint8)
+    buffer[: len(content)] = np.frombuffer(content, np.uint8)
+    buffer[_TEXT:] = np.frombuffer(np.array([len(content), failed], np.uint32).tobytes(), np.uint8)
+    buffer = np.asarray(multihost_utils.broadcast_one_to_all(buffer))
+    size, failed = np.frombuffer(buffer[_TEXT:].tobytes(), np.uint32).tolist()
+    text = buffer[:size].tobytes().decode(errors="replace")
+    if failed:
+        raise ValueError(text)
+    return text
+
+
+def wait_for_all() -> None:
+    """Waits until every process has come here."""
+    if alone():
+        return
+    # orbax has the barrier of jax's coordination service, which jax itself does not export.
+    from orbax.checkpoint import multihost
+
+    name = f"mjx_arm_{next(_barriers)}"
+    multihost.get_barrier_sync_fn()(key=name, timeout_ms=_PATIENCE)
+
+
+def watch_others() -> None:
+    """Ends this process with one sentence where another one is lost, in a thread of its own.
+
+    A collective waits for a lost process for ever. When process 0 is lost, which hosts the meeting,
+    jax ends the others at once and in its own words.
+    """
+    if alone():
+        return
+    from orbax.checkpoint import multihost
+
+    meet = multihost.get_barrier_sync_fn()
+
+    def watch() -> None:
+        for number in itertools.count():
+            if _ending.wait(_PERIOD):
+                return
+            try:
+                meet(key=f"mjx_arm_alive_{number}", timeout_ms=1_000 * _SILENCE)
+            except Exception as error:
+                if _ending.is_set():
+                    return
+                os.write(2, f"error: {lost_sentence(error)}\n".encode())
+                os._exit(2)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
+def lost_sentence(error: Exception) -> str:
+    """What to say of an error of jax that ends one of several processes."""
+    reason = " ".join(str(error).split())[:120]
+    return (
+        f"the processes of the run have lost one another ({reason}): "
+        "start all of them again with --resume and the run folder"
+    )
+
+
+def end_together(status: int) -> None:
+    """Ends this process with the others, or at once where it has failed.
+
+    Args:
+      status: exit status of the process.
+    """
+    if not jax.distributed.is_initialized():
+        return
+    if status in (0, 130):
+        wait_for_all()
+        _ending.set()
+        jax.distributed.shutdown()
+        return
+    # At exit jax would wait for processes that may be lost. Process 0 hosts the meeting: the others
+    # print what they have to say before jax ends them with it.
+    if is_writer():
+        time.sleep(2)
+    for stream in (sys.stdout, sys.stderr):
+        stream.flush()
+    os._exit(status)

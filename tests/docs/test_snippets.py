@@ -1,0 +1,204 @@
+"""Every snippet of README and documentation runs, with few steps where it trains.
+
+Commands of the shell are checked by default: their program, their options, the files that they
+name. Those of `mjx-arm` also run, as slow tests.
+"""
+
+from __future__ import annotations
+
+import itertools
+import os
+import pathlib
+import re
+import shutil
+import subprocess
+import sys
+import tomllib
+import types
+
+import pytest
+from doc_pages import ROOT, Snippet, all_snippets, commands, split_environment
+
+import mjx_arm
+from mjx_arm.cli import _parse, main
+from mjx_arm.training.agent import find_agent
+
+# What a training is shortened to. The last one of an option counts.
+_SHORT = {
+    "total-steps": 1024,
+    "chunk-steps": 512,
+    "num-envs": 8,
+    "replay-size": 2048,
+    "learning-starts": 64,
+    "select-every": 0,
+    "eval-episodes": 2,
+    "max-steps": 20,
+}
+_SHORT_BATCH = {
+    "dqn": {"batch-size": 16},
+    "distill": {
+        "teacher-batch-size": 16,
+        "teacher-hidden": 16,
+        "student-batch-size": 16,
+        "student-starts": 256,
+    },
+}
+_SHORT_TRIES = {"eval": {"episodes": 2, "max-steps": 20}, "play": {"max-steps": 20}}
+_SHELL = all_snippets("sh")
+
+
+def _name(snippet: Snippet) -> str:
+    return f"{snippet.page}:{snippet.line}"
+
+
+@pytest.fixture
+def folder(tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch) -> pathlib.Path:
+    """A folder like a clone of the repository, with runs in it; the working directory."""
+    for name in ("examples", "docs", "benchmarks", "requirements", "Makefile", "train.py"):
+        (tmp_path / name).symlink_to(ROOT / name)
+    for run in ("runs/NAME", "runs/three/seed-1"):
+        (tmp_path / run).mkdir(parents=True)
+        shutil.copy(find_agent(pathlib.Path("agent-b")), tmp_path / run / "best.safetensors")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    return tmp_path
+
+
+def _python_pages() -> list[object]:
+    """The snippets of each page with the same mark, which share their names."""
+    found = []
+    key = lambda each: (each.page, each.mark)  # noqa: E731
+    for (page, mark), group in itertools.groupby(sorted(all_snippets("python"), key=key), key):
+        # The README has no room for a comment, and its snippet compiles for half a minute.
+        mark = "slow" if page == "README.md" else mark
+        marks = [getattr(pytest.mark, mark)] if mark else []
+        found.append(pytest.param(list(group), id=page, marks=marks))
+    return found
+
+
+@pytest.mark.parametrize("group", _python_pages())
+def test_python_snippets_run(
+    group: list[Snippet], folder: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+):
+    module = types.ModuleType("snippet")
+    monkeypatch.setitem(sys.modules, "snippet", module)
+    for each in group:
+        # As many lines before it as in the page, for the traceback.
+        code = "\n" * (each.line - 1) + each.text
+        path = str(ROOT / each.page)
+        exec(compile(code, path, "exec", dont_inherit=True), module.__dict__)
+
+
+@pytest.mark.parametrize("snippet", _SHELL, ids=_name)
+def test_shell_snippets_name_what_there_is(snippet: Snippet, folder: pathlib.Path):
+    subprocess.run(["bash", "-n", "-c", snippet.text], check=True)
+    for words in commands(snippet.text):
+        environment, words = split_environment(words)
+        sys.path.extend(environment.get("PYTHONPATH", "").split(":"))
+        program = pathlib.Path(words[0]).name
+        assert program in _CHECKS, f"no check for {program}"
+        _CHECKS[program](words[1:])
+
+
+def _check_mjx_arm(words: list[str]) -> None:
+    if "--help" not in words:
+        _parse(words)
+
+
+def _check_make(words: list[str]) -> None:
+    environment = {k: v for k, v in os.environ.items() if not k.startswith(("MAKE", "MFLAGS"))}
+    subprocess.run(["make", "--dry-run", *words], check=True, capture_output=True, env=environment)
+
+
+def _check_python(words: list[str]) -> None:
+    script = pathlib.Path(words[0])
+    assert script.is_file(), script
+    text = script.read_text()
+    if "parse_known_args" not in text:
+        for option in (word for word in words if word.startswith("--")):
+            assert f'"{option}"' in text, f"{script} has no {option}"
+
+
+def _check_pip(words: list[str]) -> None:
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"][
+        "optional-dependencies"
+    ]
+    assert words[:2] == ["install", "--editable"]
+    assert re.fullmatch(r"\.\[(\w+)\]", words[2])[1] in extras
+
+
+def _check_sbatch(words: list[str]) -> None:
+    assert pathlib.Path(words[0]).is_file()
+    _parse(["train", *(word.replace("$seed", "0") for word in words[1:])])
+
+
+def _check_source(words: list[str]) -> None:
+    assert words == [".venv/bin/activate"]
+
+
+_CHECKS = {
+    "make": _check_make,
+    "mjx-arm": _check_mjx_arm,
+    "pip": _check_pip,
+    "python": _check_python,
+    "sbatch": _check_sbatch,
+    "source": _check_source,
+}
+
+
+def _runs() -> list[object]:
+    """The different commands `mjx-arm` of all pages that can run on this machine."""
+    found = {}
+    for snippet in _SHELL:
+        for words in commands(snippet.text):
+            environment, words = split_environment(words)
+            program = pathlib.Path(words[0]).name
+            if program != "mjx-arm" or snippet.mark == "check" or "--help" in words:
+                continue
+            found.setdefault(tuple(words[1:]), (environment.get("PYTHONPATH", ""), _name(snippet)))
+    return [pytest.param(list(x), path, id=name) for x, (path, name) in found.items()]
+
+
+def _options(values: dict[str, int]) -> list[str]:
+    return [word for name, value in values.items() for word in (f"--{name}", str(value))]
+
+
+def _shortened(words: list[str]) -> list[str]:
+    if words[0] == "train":
+        algorithm = _parse(words)[0].options.algorithm
+        return [*words, *_options(_SHORT | _SHORT_BATCH[algorithm])]
+    return [*words, *_options(_SHORT_TRIES.get(words[0], {}))]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("words", "path"), _runs())
+def test_commands_of_the_pages_run(words: list[str], path: str, folder: pathlib.Path):
+    sys.path.extend(path.split(":"))
+    more = []
+    if "--resume" in words or words[0] == "figures":
+        shutil.rmtree(folder / "runs" / "NAME")
+        start = ["train", "--preset", "state", "--out", "runs/NAME"]
+        assert main(_shortened(start)) == 0
+        more = ["--eval-episodes", "2"] if "--resume" in words else []
+        if "--total-steps" in words:
+            words = words[: words.index("--total-steps")]
+            more += ["--total-steps", "1536"]
+    arguments = [*words, *more] if more or words[0] == "figures" else _shortened(words)
+    assert main(arguments) == 0
+
+
+@pytest.mark.slow
+def test_the_job_script_starts_a_run_and_continues_it(tmp_path: pathlib.Path):
+    """The script of the page about Slurm, by bash."""
+    script = ROOT / "docs" / "how-to" / "train.sbatch"
+    path = f"{pathlib.Path(sys.executable).parent}:{os.environ['PATH']}"
+    environment = os.environ | {"RUN": "runs/first", "PATH": path}
+    options = _options(_SHORT | _SHORT_BATCH["dqn"])
+    command = ["bash", str(script), "--preset", "state", *options]
+    for expected in ("training:", "resuming after"):
+        done = subprocess.run(
+            command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
+        )
+        assert done.returncode == 0, done.stderr
+        assert expected in done.stdout
+    assert mjx_arm.load_agent(tmp_path / "runs" / "first").env_steps == 1024

@@ -1,0 +1,250 @@
+"""What several devices of one process compute, as JSON; `test_devices.py` starts it and judges.
+
+XLA_FLAGS=--xla_force_host_platform_device_count=4 python tests/training/devices_lab.py CHECK ...
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jax.sharding import PartitionSpec as P
+
+from mjx_arm.algos.distill import Distill
+from mjx_arm.algos.dqn import QLearning
+from mjx_arm.algos.frames import Frames
+from mjx_arm.algos.replay import Batch, Step, init_replay, sample
+from mjx_arm.config import DistillConfig, set_train_options, train_config
+from mjx_arm.networks import FeatureQNetwork
+from mjx_arm.training.evaluate import make_evaluator
+from mjx_arm.training.loop import make_train, make_trainer, run_keys
+from mjx_arm.training.memory import memory_plan
+from mjx_arm.training.mesh import fetch, make_mesh, shard_of, sharded
+
+jax.config.update("jax_numpy_dtype_promotion", "strict")
+
+CONFIG = train_config(
+    observation="state",
+    physics="native",
+    num_envs=8,
+    replay_size=800,
+    batch_size=8,
+    learning_starts=40,
+    chunk_steps=160,
+    max_steps=15,
+    hidden=16,
+)
+
+
+def bits(tree) -> list[np.ndarray]:
+    """The whole arrays of a tree, keys as the words behind them."""
+    return [
+        np.asarray(jax.random.key_data(x) if jnp.issubdtype(x.dtype, jax.dtypes.prng_key) else x)
+        for x in jax.tree.leaves(tree)
+    ]
+
+
+def same(one, other) -> bool:
+    """Whether two trees are equal to the bit."""
+    return all(np.array_equal(a, b) for a, b in zip(bits(one), bits(other), strict=True))
+
+
+def gap(one, other) -> float:
+    """The largest difference of two trees."""
+    pairs = zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True)
+    return max(float(np.abs(np.asarray(a) - np.asarray(b)).max()) for a, b in pairs)
+
+
+def run_chunks(trainer, chunks: int):
+    state, rows = trainer.start(), []
+    for _ in range(chunks):
+        state, counts = trainer.run_chunk(state)
+        rows.append({name: float(x) for name, x in fetch(counts).items()})
+    return state, rows
+
+
+class Plain(Distill):
+    """Without Adam, which divides small gradients by their own size and so enlarges rounding."""
+
+    _optimizer = optax.sgd(0.01)
+
+
+def training() -> dict:
+    """A short training on all devices, and what is made of its agent."""
+    mesh = make_mesh(jax.device_count())
+    trainer, alone = make_trainer(CONFIG, mesh=mesh), make_trainer(CONFIG)
+    state, rows = run_chunks(trainer, 1)
+    compilations = []
+    jax.monitoring.register_event_duration_secs_listener(
+        lambda event, duration, **rest: compilations.append(event)
+    )
+    for _ in range(2):
+        state, counts = trainer.run_chunk(state)
+        rows.append({name: float(x) for name, x in fetch(counts).items()})
+    again = [event for event in compilations if "backend_compile" in event]
+    copies = [shard.data for x in jax.tree.leaves(state.learner) for shard in x.addressable_shards]
+    by_leaf = np.array_split(np.arange(len(copies)), len(copies) // mesh.size)
+    starts = np.asarray(state.replay.steps.frame["features"])[0]
+    policy = fetch(trainer.algorithm.policy(state.learner))
+    results = [
+        make_evaluator(trainer.env, trainer.algorithm.apply, episodes=10, epsilon=0.3, mesh=m)(
+            policy, jax.random.key(5)
+        )
+        for m in (None, mesh)
+    ]
+    return {
+        "counts": rows,
+        "compiled_again": again,
+        "spread": [str(x.sharding.spec) for x in (state.envs.ended, state.replay.steps.reward)],
+        "copies_agree": all(np.array_equal(copies[i[0]], copies[j]) for i in by_leaf for j in i),
+        "different_starts": len(np.unique(starts, axis=0)),
+        "plan": memory_plan(trainer.shapes()),
+        "plan_alone": memory_plan(alone.shapes()),
+        "evaluations": [dataclasses.asdict(result) for result in results],
+    }
+
+
+def samples() -> dict:
+    """What each device samples from shards that all hold the same."""
+    mesh = make_mesh(jax.device_count())
+    shard = shard_of(mesh)
+
+    def slots(key: jax.Array) -> jax.Array:
+        nothing = jnp.zeros((2,), jnp.bool_)
+        zero = nothing.astype(jnp.float32)
+        step = Step(zero, nothing.astype(jnp.uint8), zero, nothing, nothing, nothing)
+        replay = init_replay(step, 1000)
+        frame = jnp.arange(2000, dtype=jnp.float32).reshape(1000, 2)
+        steps = dataclasses.replace(replay.steps, frame=frame)
+        replay = dataclasses.replace(replay, steps=steps, count=jnp.int32(1000))
+        return sample(replay, shard.fold(key), 16, 1, 0.9).frame[None]
+
+    found = jax.jit(sharded(slots, mesh, P(), P(shard.axis)))(jax.random.key(0))
+    return {"slots": np.asarray(found).tolist()}
+
+
+def updates() -> dict:
+    """Three updates of each learner from the same samples, on 1, 2 and 4 devices."""
+
+    def features(*stored):
+        return stored[-1]["features"]
+
+    frames = Frames(features, features, features, features)
+    network = FeatureQNetwork(3, 8, dueling=True, scales=(1.0,) * 5, layer_norm=True)
+    keys = jax.random.split(jax.random.key(1), 6)
+    rows = (3, 16)
+    obs, next_obs = (jax.random.normal(key, (*rows, 5)) for key in keys[:2])
+    batch = Batch(
+        frame=obs,
+        next_frame=next_obs,
+        action=jax.random.randint(keys[2], rows, 0, 3),
+        reward=jax.random.normal(keys[3], rows),
+        discount=jnp.full(rows, 0.9),
+        # Unequal numbers of masked transitions on the devices.
+        weight=jnp.tile((jnp.arange(16) > 4).astype(jnp.float32), (3, 1)),
+    )
+    # Each device shows its own loss, so that the learners are compared by what they become.
+    parameters = {}
+    for devices in (1, 2, 4):
+        mesh = make_mesh(devices)
+        shard = shard_of(mesh)
+        learning = QLearning(
+            apply=network.apply,
+            init_params=network.init,
+            optimizer=optax.chain(optax.clip_by_global_norm(0.5), optax.sgd(0.1, momentum=0.9)),
+            double=True,
+            huber=True,
+            polyak=0.1,
+            target_period=1,
+            shard=shard,
+        )
+        pair = Plain(DistillConfig(student_polyak=0.1), frames, learning, network, 4)
+
+        def learn(batch, obs, next_obs, learning=learning, pair=pair):
+            learner = learning.init(keys[4], obs[0])
+            student = pair.init(keys[5], obs[0], {"features": obs[0]}).student
+
+            def once(carry, row):
+                learner, student = carry
+                learner, metrics = learning.update(learner, *row)
+                student, other = pair.imitate(
+                    student, row[1], learning.apply(learner.params, row[2])
+                )
+                return (learner, student), metrics | other
+
+            carry, metrics = jax.lax.scan(once, (learner, student), (batch, obs, next_obs))
+            return carry[0].params, carry[1].averaged, carry[1].spread, metrics
+
+        spec = P(None, shard.axis)
+        run = jax.jit(sharded(learn, mesh, (spec, spec, spec), P()))
+        parameters[devices] = jax.device_get(run(batch, obs, next_obs))
+    return {
+        "gaps": [gap(parameters[1], parameters[devices]) for devices in (2, 4)],
+        "learnt": gap(parameters[1][0], learning.init(keys[4], obs[0]).params),
+    }
+
+
+def seeds() -> dict:
+    """Four seeds over the devices, and the same seeds one by one; and five, which they share."""
+    config = set_train_options(CONFIG, {"num_seeds": 4})
+    state, counts = make_trainer(config, mesh=(mesh := make_mesh(4))).run_chunk(
+        make_trainer(config, mesh=mesh).start()
+    )
+    single = make_trainer(CONFIG)
+    gaps, actions = [], []
+    for seed in range(4):
+        alone, _ = single.run_chunk(single.init(run_keys(dataclasses.replace(CONFIG, seed=seed))))
+        own = jax.tree.map(lambda x, seed=seed: np.asarray(x)[seed], state.learner.params)
+        gaps.append(gap(own, alone.learner.params))
+        actions.append(same(state.replay.steps.action[seed], alone.replay.steps.action))
+    five = make_trainer(set_train_options(CONFIG, {"num_seeds": 5}), mesh=mesh)
+    shared, _ = five.run_chunk(five.start())
+    return {
+        "spread": str(state.envs.ended.sharding.spec),
+        "updates": np.asarray(counts["updates"]).tolist(),
+        "gaps": gaps,
+        "same_actions": actions,
+        "five": [str(shared.envs.ended.sharding.spec), list(shared.envs.ended.shape)],
+    }
+
+
+def whole_run() -> dict:
+    """`make_train` under a mesh, in both ways, with and without `jax.set_mesh`."""
+    config = set_train_options(CONFIG, {"total_steps": 320})
+    mesh = jax.make_mesh((4,), ("data",))
+    shared, own = make_train(config, mesh=mesh), make_train(config)
+    found = {}
+    with jax.set_mesh(mesh):
+        state, counts = jax.jit(shared)(run_keys(config))
+        found["updates"] = np.asarray(counts["updates"]).tolist()
+        found["spread"] = str(state.envs.ended.sharding.spec)
+        by_seed = jax.shard_map(
+            jax.vmap(own), in_specs=P("data"), out_specs=P("data"), check_vma=False
+        )
+        keys = jax.random.split(jax.random.key(0), 4)
+        seeds, _ = jax.jit(by_seed)(jax.device_put(keys, P("data")))
+        found["seeds"] = list(seeds.envs.ended.shape)
+    trainer = make_trainer(config, mesh=mesh)
+    found["gap"] = gap(state.learner.params, run_chunks(trainer, 2)[0].learner.params)
+    return found
+
+
+def repeats() -> dict:
+    """Native physics on four devices, 200 programs one after another."""
+    trainer = make_trainer(CONFIG, mesh=make_mesh(4))
+    state = trainer.start()
+    for done in range(200):
+        state, counts = trainer.run_chunk(state)
+        # Some wait for the result, others are handed in while the one before runs.
+        if done % 3 == 0:
+            jax.block_until_ready(counts)
+    return {"steps": int(state.vector_step), "diverged": float(counts["diverged"])}
+
+
+if __name__ == "__main__":
+    print(json.dumps({name: globals()[name]() for name in sys.argv[1:]}))

@@ -1,0 +1,245 @@
+"""Several processes that train one run, on this machine."""
+
+from __future__ import annotations
+
+import json
+import os
+import pathlib
+import signal
+import socket
+import subprocess
+import sys
+import time
+
+import jax
+import numpy as np
+import pytest
+
+from mjx_arm.cli import main
+from mjx_arm.report.metrics import read_metrics
+from mjx_arm.training.checkpoint import RunCheckpoints
+from mjx_arm.training.loop import make_trainer, run_keys
+from mjx_arm.training.processes import detects_processes, join_processes
+from mjx_arm.training.run_folder import load_config
+
+LAB = pathlib.Path(__file__).with_name("processes_lab.py")
+ROOT = LAB.parents[2]
+OPTIONS = [
+    *("--preset", "pixels", "--observation", "state", "--physics", "native", "--num-envs", "8"),
+    *("--replay-size", "800", "--batch-size", "8", "--learning-starts", "40", "--hidden", "16"),
+    *("--chunk-steps", "160", "--max-steps", "15", "--size", "16", "16", "--eval-episodes", "4"),
+    *("--select-every", "3200", "--select-episodes", "4"),
+]
+# A run of 40 chunks, with a checkpoint after every tenth.
+TOTAL = ["--total-steps", "6400"]
+# A run that no test waits for.
+LONG = ["--total-steps", "100000000"]
+
+
+def start(*command: str, processes: int = 2, devices: int = 2) -> list[subprocess.Popen]:
+    """Starts the processes of one program, which takes its place among them as options."""
+    with socket.socket() as free:
+        free.bind(("localhost", 0))
+        port = free.getsockname()[1]
+    flags = f"--xla_force_host_platform_device_count={devices}"
+    env = os.environ | {"XLA_FLAGS": flags, "PYTHONPATH": str(ROOT)}
+    place = [f"localhost:{port}", str(processes)]
+    if command[0] == "-m":
+        place = ["--coordinator", place[0], "--num-processes", place[1], "--process-id"]
+    return [
+        subprocess.Popen(
+            [sys.executable, *command, *place, str(process)],
+            env=env,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        for process in range(processes)
+    ]
+
+
+def finish(started: list[subprocess.Popen], timeout: float = 900) -> list[tuple[int, str, str]]:
+    """Exit status, output and errors of each process; none outlives the test."""
+    deadline = time.monotonic() + timeout
+    try:
+        ended = [x.communicate(timeout=max(1.0, deadline - time.monotonic())) for x in started]
+    finally:
+        for process in started:
+            process.kill()
+            process.communicate()
+    return [(x.returncode, *texts) for x, texts in zip(started, ended, strict=True)]
+
+
+def train(*arguments: str) -> list[subprocess.Popen]:
+    return start("-m", "mjx_arm", "train", *arguments)
+
+
+def wait_for_checkpoint(folder: pathlib.Path, started: list[subprocess.Popen]) -> None:
+    deadline = time.monotonic() + 600
+    while RunCheckpoints(folder).newest() is None:
+        assert time.monotonic() < deadline
+        assert all(process.poll() is None for process in started), finish(started)
+        time.sleep(0.1)
+
+
+def final_state(folder: pathlib.Path) -> list[np.ndarray]:
+    """The newest checkpoint, read on one device."""
+    like = jax.eval_shape(make_trainer(load_config(folder)).init, run_keys(load_config(folder)))
+    checkpoints = RunCheckpoints(folder)
+    state = checkpoints.load(checkpoints.find_newest(like), like)
+    return [
+        np.asarray(
+            jax.random.key_data(x) if jax.dtypes.issubdtype(x.dtype, jax.dtypes.prng_key) else x
+        )
+        for x in jax.tree.leaves(state)
+    ]
+
+
+def same(one: pathlib.Path, other: pathlib.Path) -> bool:
+    return all(
+        np.array_equal(a, b) for a, b in zip(final_state(one), final_state(other), strict=True)
+    )
+
+
+def test_processes_agree():
+    ended = finish(start(str(LAB)), timeout=300)
+    assert [status for status, *_ in ended] == [0, 0], ended
+    # Before it gloo reports its connections.
+    first, second = (json.loads(output.splitlines()[-1]) for _, output, _ in ended)
+    assert (first.pop("writer"), second.pop("writer")) == (True, False)
+    assert first == second
+    assert first == {
+        "alone": False,
+        "said": "process 0 wrote",
+        "one": True,
+        "none": False,
+        "failed": "only process 0 can say this",
+        "devices": 4,
+        "key": [0, 3],
+    }
+
+
+SLURM = {
+    "SLURM_JOB_ID": "7",
+    "SLURM_STEP_NODELIST": "node[1-2]",
+    "SLURM_PROCID": "0",
+    "SLURM_LOCALID": "0",
+    "SLURM_NTASKS": "4",
+}
+
+
+@pytest.mark.parametrize(
+    ("environ", "several"),
+    [
+        ({}, False),
+        (SLURM, True),
+        (SLURM | {"SLURM_NTASKS": "1"}, False),
+        # A shell in an allocation for four tasks is a step of one.
+        (SLURM | {"SLURM_STEP_NUM_TASKS": "1"}, False),
+        # A batch script without srun is no step.
+        ({name: x for name, x in SLURM.items() if name != "SLURM_STEP_NODELIST"}, False),
+        ({"OMPI_MCA_orte_hnp_uri": "1.0;tcp://10.0.0.1:1", "OMPI_COMM_WORLD_SIZE": "2"}, True),
+        ({"OMPI_MCA_orte_hnp_uri": "1.0;tcp://10.0.0.1:1", "OMPI_COMM_WORLD_SIZE": "1"}, False),
+        # A pod that is no part of an indexed job.
+        ({"KUBERNETES_SERVICE_HOST": "10.0.0.1"}, False),
+    ],
+)
+def test_several_processes_are_those_that_a_launcher_reports(environ, several):
+    assert detects_processes(environ) is several
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--num-processes", "2"], "go together"),
+        (["--coordinator", "host", "--num-processes", "2", "--process-id", "0"], "HOST:PORT"),
+        (
+            ["--coordinator", "h:1", "--num-processes", "0", "--process-id", "0"],
+            "at least 1, got 0",
+        ),
+        (
+            ["--coordinator", "h:1", "--num-processes", "2", "--process-id", "2"],
+            "from 0 to 1, got 2",
+        ),
+        (["--process-id", "one"], "--process-id must be"),
+    ],
+)
+def test_invalid_options_are_one_sentence(options, message, capsys):
+    assert main(["train", "--preset", "pixels", *options]) == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") == 1
+
+
+def test_one_process_is_no_meeting():
+    join_processes("host:1", 1, 0)
+    assert not jax.distributed.is_initialized()
+
+
+@pytest.mark.slow
+def test_a_run_of_two_processes_is_stopped_and_resumed_to_the_bit(tmp_path):
+    whole, again, cut = (tmp_path / name for name in ("whole", "again", "cut"))
+    for folder in (whole, again):
+        ended = finish(train(*OPTIONS, *TOTAL, "--out", str(folder)))
+        assert [status for status, *_ in ended] == [0, 0], ended
+        # Process 0 alone reports.
+        assert "evaluation: " in ended[0][1]
+        assert all(line.startswith("[Gloo]") for line in ended[1][1].splitlines())
+    started = train(*OPTIONS, *TOTAL, "--out", str(cut))
+    wait_for_checkpoint(cut, started)
+    started[1].send_signal(signal.SIGTERM)
+    ended = finish(started)
+    assert [status for status, *_ in ended] == [130, 130], ended
+    assert "saved; continue with" in ended[0][2]
+    rows = read_metrics(cut)
+    assert len(rows) < len(read_metrics(whole)) == 40
+    ended = finish(train("--resume", str(cut), "--eval-episodes", "4"))
+    assert [status for status, *_ in ended] == [0, 0], ended
+    assert same(whole, again)
+    assert same(whole, cut)
+    names = sorted(path.name for path in whole.iterdir())
+    assert {"config.json", "metrics.jsonl", "last.safetensors", "policy.mp4"} <= set(names)
+    assert names == sorted(path.name for path in cut.iterdir())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("lost", [0, 1])
+def test_when_a_process_is_lost_the_others_end_and_the_run_resumes_with_one(lost, tmp_path):
+    folder = tmp_path / "run"
+    started = train(*OPTIONS, *LONG, "--out", str(folder))
+    wait_for_checkpoint(folder, started)
+    started[lost].kill()
+    left = started[1 - lost]
+    _, error = left.communicate(timeout=60)
+    assert left.returncode != 0
+    assert "Traceback" not in error
+    if lost == 1:
+        # jax itself ends the others, in its own words, when process 0 is lost.
+        assert "have lost one another" in error
+        assert error.count("\n") == 1
+    finish([started[lost]])
+    done = RunCheckpoints(folder).steps()[-1] * 8
+    arguments = ["--resume", str(folder), "--total-steps", str(done + 320), "--eval-episodes", "4"]
+    assert main(["train", *arguments]) == 0
+    assert [row["env_steps"] for row in read_metrics(folder)] == list(range(160, done + 321, 160))
+
+
+@pytest.mark.slow
+def test_a_run_of_four_devices_is_resumed_to_the_bit_and_on_fewer(tmp_path):
+    whole, cut = tmp_path / "whole", tmp_path / "cut"
+
+    def run(*arguments: str) -> str:
+        command = ("-m", "mjx_arm", "train", *arguments)
+        ((status, output, error),) = finish(start(*command, processes=1, devices=4))
+        assert status == 0, error
+        return output
+
+    said = run(*OPTIONS, "--total-steps", "3200", "--out", str(whole))
+    assert "devices: 4, each with a part of the environments" in said
+    run(*OPTIONS, "--total-steps", "1600", "--out", str(cut))
+    more = ["--resume", str(cut), "--eval-episodes", "4", "--total-steps"]
+    run(*more, "3200")
+    assert same(whole, cut)
+    said = run(*more, "3520", "--devices", "2")
+    assert "devices: 2, each with a part of the environments" in said
+    assert [row["env_steps"] for row in read_metrics(cut)] == list(range(160, 3521, 160))
