@@ -273,7 +273,7 @@ def _cells() -> dict[str, list[Cell]]:
     first = [
         Cell("device", "device", device, 1),
         Cell("parity", "parity", parity, 20),
-        Cell("a", "train-a", part(train, env="A", goal=0.95, minutes=4.0), 60),
+        Cell("a", "train-a", part(train, env="A", goal=0.95, minutes=4.0), 120),
     ]
     for num_envs in (8_192, 1_024):
         first += [
@@ -281,23 +281,23 @@ def _cells() -> dict[str, list[Cell]]:
                 f"physics+render at {num_envs}",
                 "throughput",
                 part(environment, num_envs=num_envs),
-                30,
+                60,
             ),
-            Cell(f"training at {num_envs}", "throughput", part(training, num_envs=num_envs), 45),
+            Cell(f"training at {num_envs}", "throughput", part(training, num_envs=num_envs), 90),
         ]
     many = 8_192
     for convolution in ("nn.Conv", "patches"):
         measure = part(training, num_envs=many, convolution=convolution)
-        first.append(Cell(f"convolution {convolution}", "comparisons", measure, 45))
+        first.append(Cell(f"convolution {convolution}", "comparisons", measure, 90))
     for precision in ("highest", "default"):
         measure = part(training, num_envs=many, precision=precision)
-        first.append(Cell(f"precision {precision}", "comparisons", measure, 45))
+        first.append(Cell(f"precision {precision}", "comparisons", measure, 90))
     for name, fence in (("fused", False), ("fenced", True)):
         measure = part(environment, num_envs=many, fence=fence)
-        first.append(Cell(f"ray cast {name}", "comparisons", measure, 30))
+        first.append(Cell(f"ray cast {name}", "comparisons", measure, 60))
     for physics in ("mjx", "mjx-warp"):
         measure = part(environment, num_envs=many, stage="physics", physics=physics)
-        first.append(Cell(f"physics {physics}", "comparisons", measure, 30))
+        first.append(Cell(f"physics {physics}", "comparisons", measure, 60))
     # Squint (arXiv 2602.21203): 1,024 environments, images of 16 by 16, a replay of 1 M and 256
     # updates of 512 in each 1,024 steps, discount 0.9. Theirs is SAC; ours is DQN.
     squint = {
@@ -312,16 +312,16 @@ def _cells() -> dict[str, list[Cell]]:
     }
     published = [
         # Playground's PandaPickCubeCartesian: 1,024 environments of 64 by 64 pixels.
-        Cell("playground", "published", part(environment, num_envs=1_024), 30),
+        Cell("playground", "published", part(environment, num_envs=1_024), 60),
         Cell(
             "playground, physics",
             "published",
             part(environment, num_envs=1_024, stage="physics"),
-            30,
+            60,
         ),
-        Cell("squint", "published", part(training, num_envs=1_024, **squint), 60),
+        Cell("squint", "published", part(training, num_envs=1_024, **squint), 90),
     ]
-    b = [Cell("b", "train-b", part(train, env="B", goal=1.1, minutes=8.0), 60)]
+    b = [Cell("b", "train-b", part(train, env="B", goal=1.1, minutes=8.0), 120)]
     return {"": first, "b": b, "published": published}
 
 
