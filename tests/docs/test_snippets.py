@@ -44,6 +44,8 @@ _SHORT_BATCH = {
     },
 }
 _SHORT_TRIES = {"eval": {"episodes": 2, "max-steps": 20}, "play": {"max-steps": 20}}
+# These wait for a browser, train many runs or need several; they have tests of their own.
+_OWN_TESTS = {"compare", "sweep", "view"}
 _SHELL = all_snippets("sh")
 
 
@@ -154,6 +156,8 @@ def _runs() -> list[object]:
             environment, words = split_environment(words)
             program = pathlib.Path(words[0]).name
             if program != "mjx-arm" or snippet.mark == "check" or "--help" in words:
+                continue
+            if words[1:2] and words[1] in _OWN_TESTS:
                 continue
             found.setdefault(tuple(words[1:]), (environment.get("PYTHONPATH", ""), _name(snippet)))
     return [pytest.param(list(x), path, id=name) for x, (path, name) in found.items()]
