@@ -1,4 +1,4 @@
-"""Metrics of a run on disk: one JSON object a line, and TensorBoard events."""
+"""Metrics of a run on disk: one JSON object per line, and TensorBoard events."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ class MetricsWriter:
     def __init__(self, folder: pathlib.Path):
         self._file = (folder / "metrics.jsonl").open("a", buffering=1)
         (folder / "tensorboard").mkdir(exist_ok=True)
-        # Not tensorboardX's SummaryWriter: on a full disk its thread dies, and who writes waits for
-        # it for ever.
+        # Not tensorboardX's SummaryWriter: on a full disk its thread dies, and the next write waits
+        # for it for ever.
         self._events = EventsWriter(str(folder / "tensorboard" / "events"))
 
     def __enter__(self) -> Self:
@@ -52,7 +52,7 @@ class MetricsWriter:
 
 
 def keep_metrics(folder: pathlib.Path, env_steps: int) -> None:
-    """Drops the lines of `metrics.jsonl` after so many environment steps, which come again.
+    """Drops the lines of `metrics.jsonl` after a number of environment steps.
 
     Raises:
       ValueError: a line is damaged.

@@ -1,4 +1,4 @@
-"""A video of a policy: the scene in large, and beside it what the agent sees."""
+"""A video of a policy: the scene, and beside it what the agent sees."""
 
 from __future__ import annotations
 
@@ -115,7 +115,7 @@ def draw_episode(env: Env, episode: Episode) -> Iterator[np.ndarray]:
     rows, columns = (np.arange(_EDGE) * edge // _EDGE for edge in env.config.size)
     for start in range(0, len(episode.qpos), _AT_ONCE):
         qpos = episode.qpos[start : start + _AT_ONCE]
-        # Of one length, or the last ones would compile again.
+        # All parts have one length: another length would compile again.
         padded = np.concatenate([qpos, np.repeat(qpos[-1:], _AT_ONCE - len(qpos), axis=0)])
         scenes, views = jax.device_get(render_some(padded))
         for i, (scene, view) in enumerate(zip(scenes[: len(qpos)], views, strict=False)):
@@ -165,7 +165,7 @@ def write_video(path: pathlib.Path, frames: Iterable[np.ndarray]) -> None:
       ValueError: another ending, or it could not be written.
     """
     check_video_path(path)
-    # Without it the encoder is forked from a process full of threads, which may deadlock.
+    # Without this, the encoder is forked from a process with many threads, and may deadlock.
     os.environ.setdefault("IMAGEIO_FFMPEG_NO_PREVENT_SIGINT", "1")
     import imageio.v2 as imageio
 
@@ -180,7 +180,7 @@ def write_video(path: pathlib.Path, frames: Iterable[np.ndarray]) -> None:
                 writer.append_data(frame)
         part.replace(path)
     except OSError as error:
-        # What imageio says of its encoder goes on for many lines.
+        # imageio's message about its encoder has many lines.
         reason = str(error.strerror or error).splitlines()[0]
         raise ValueError(f"{path} could not be written: {reason}") from error
     finally:
