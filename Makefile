@@ -21,7 +21,7 @@ STAMP := $(VENV)/.locked-$(LOCK)
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 SUPPORTED := import sys; sys.exit(sys.version_info[:2] not in {(3, 11), (3, 12), (3, 13)})
 
-.PHONY: help setup train play test test-slow test-campaign peers test-peers docs format lock lock-peers \
+.PHONY: help setup train play test test-slow test-long test-campaign peers test-peers docs format lock lock-peers \
   lock-docs clean
 
 help:
@@ -30,6 +30,7 @@ help:
 	@echo "make play       video.mp4 of a shipped agent; AGENT=..., ARGS=\"--env A --out other.mp4\""
 	@echo "make test       ruff, mypy and the default tests"
 	@echo "make test-slow  the tests marked slow"
+	@echo "make test-long  the tests marked long, an hour or more; CI leaves them out"
 	@echo "make test-campaign  tries to break runs and files, two hours; ARGS=\"--parts kills\" for a part"
 	@echo "make peers      build $(PEERS) with what we are measured against"
 	@echo "make test-peers the tests of the adapters, with trainers of others"
@@ -68,6 +69,9 @@ test: $(STAMP)
 
 test-slow: $(STAMP)
 	$(BIN)/python -m pytest -m slow
+
+test-long: $(STAMP)
+	$(BIN)/python -m pytest -m long
 
 # Outside the repository nothing is written; ARGS="--table FILE" keeps the results.
 test-campaign: $(STAMP)

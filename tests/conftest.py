@@ -14,15 +14,18 @@ if sys.platform.startswith("linux"):
             os.environ.setdefault("MUJOCO_GL", backend)
             break
 
-# Most of a test is compiling. The processes of one test run share what they have compiled; the
-# limit in bytes makes jax lock the folder, so that none reads what another is still writing.
-if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
-    _cache = tempfile.mkdtemp(prefix="mjx-arm-tests-")
-    atexit.register(shutil.rmtree, _cache, ignore_errors=True)
-    os.environ["JAX_COMPILATION_CACHE_DIR"] = _cache
-    os.environ["JAX_COMPILATION_CACHE_MAX_SIZE"] = str(2**33)
-    os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.2"
+# Most of a test is compiling, so the workers of one test run share what they have compiled. They
+# find the folder by this variable. Processes that tests start do not use it: some are killed, or
+# cannot write, and would leave half a program there.
+_CACHE = "MJX_ARM_TEST_CACHE"
+if _CACHE not in os.environ:
+    os.environ[_CACHE] = tempfile.mkdtemp(prefix="mjx-arm-tests-")
+    atexit.register(shutil.rmtree, os.environ[_CACHE], ignore_errors=True)
 
-import jax
+import jax  # noqa: E402
 
 jax.config.update("jax_numpy_dtype_promotion", "strict")
+jax.config.update("jax_compilation_cache_dir", os.environ[_CACHE])
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
+# A limit in bytes makes jax lock the folder: no worker reads what another one is still writing.
+jax.config.update("jax_compilation_cache_max_size", 2**33)

@@ -66,7 +66,7 @@ def test_it_does_without_what_a_bare_machine_lacks():
     assert done.stdout.strip() == "3", done.stderr
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("only", ["", "b", "published"])
 def test_every_cell_is_rehearsed(only, tmp_path):
     gpu.main(

@@ -1,7 +1,7 @@
 """Every snippet of README and documentation runs, with few steps where it trains.
 
 Commands of the shell are checked by default: their program, their options, the files that they
-name. Those of `mjx-arm` also run, as slow tests.
+name. Those of `mjx-arm` also run, as long tests.
 """
 
 from __future__ import annotations
@@ -174,7 +174,7 @@ def _shortened(words: list[str]) -> list[str]:
     return [*words, *_options(_SHORT_TRIES.get(words[0], {}))]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(("words", "path"), _runs())
 def test_commands_of_the_pages_run(words: list[str], path: str, folder: pathlib.Path):
     sys.path.extend(path.split(":"))

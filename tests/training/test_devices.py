@@ -102,7 +102,7 @@ def test_a_whole_run_is_one_function_under_a_mesh():
     assert found["gap"] < 1e-5
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_native_physics_on_four_devices_never_hangs():
     found = four_devices("repeats", timeout=1800)["repeats"]
     assert found == {"steps": 200 * 20, "diverged": 0.0}

@@ -203,11 +203,15 @@ def test_own_parts_reach_a_trainer():
         make_trainer(CONFIG, env=env, reward=reward)
 
 
-def test_a_lambda_cannot_be_resumed_and_is_refused_before_anything_is_made(tmp_path):
+def test_a_lambda_trains_and_the_run_says_that_it_cannot_be_resumed(tmp_path):
     folder = tmp_path / "run"
-    with pytest.raises(ValueError, match=r"reward is .*, which no other process can import"):
-        train(folder, reward=lambda before, after, action: {})
-    assert not folder.exists()
+    reward = lambda before, after, action: {"height": after.measured["height"]}  # noqa: E731
+    results, output = train(folder, reward=reward)
+    assert [result.episodes for result in results] == [2]
+    assert "warning: reward is " in output
+    assert "which no other process can have: this run cannot be resumed" in output
+    with pytest.raises(ValueError, match=r"was made with reward=.*, which only the process that"):
+        resume(folder, total_steps=800)
 
 
 def test_on_chunk_sees_metrics_and_state_of_every_chunk(plain, tmp_path):
