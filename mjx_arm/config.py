@@ -312,17 +312,17 @@ def set_train_options(config: TrainConfig, values: Mapping[str, Any]) -> TrainCo
     Raises:
       ValueError: an unknown option, or a value that it does not take.
     """
-    values = dict(values)
-    task = values.pop("task", config.env.task)
+    groups: dict[str, Any] = {}
+    task = values.get("task", config.env.task)
     check_value("task", str, task)
     if task != config.env.task:
-        config = dataclasses.replace(config, env=set_env_options(config.env, {"task": task}))
-    algorithm = values.pop("algorithm", config.algorithm)
+        groups["env"] = set_env_options(config.env, {"task": task})
+    algorithm = values.get("algorithm", config.algorithm)
     check_value("algorithm", str, algorithm)
     if algorithm != config.algorithm:
         check_name("algorithm", algorithm, _ALGORITHMS)
-        config = dataclasses.replace(config, algorithm=algorithm, algo=_ALGORITHMS[algorithm]())
-    return set_options(config, values)
+        groups["algo"] = _ALGORITHMS[algorithm]()
+    return set_options(config, values, groups)
 
 
 def advice(config: TrainConfig) -> list[str]:

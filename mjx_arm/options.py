@@ -233,17 +233,25 @@ def get_option(config: Any, name: str) -> Any:
     return functools.reduce(getattr, places[name], config)
 
 
-def set_options(config: T, values: Mapping[str, Any]) -> T:
+def set_options(config: T, values: Mapping[str, Any], groups: Mapping[str, Any] | None = None) -> T:
     """The same options with some changed, each named without its group.
 
-    Lists count as tuples.
+    Lists count as tuples. Only the result is checked, whatever the order of the changes.
+
+    Args:
+      config: the options.
+      values: new values by name.
+      groups: nested options that replace those of the same field first.
 
     Raises:
       ValueError: an unknown name, or a value that the option does not take.
     """
-    places = flat_names(config)
+    groups = {} if groups is None else groups
+    places = {name: path for name, path in flat_names(config).items() if path[0] not in groups}
+    for group, options in groups.items():
+        places |= {name: (group, *path) for name, path in flat_names(options).items()}
     changes: dict[str, dict[str, Any]] = {}
-    own: dict[str, Any] = {}
+    own: dict[str, Any] = dict(groups)
     for name, value in values.items():
         check_name("option", name, places)
         value = tuple(value) if isinstance(value, list) else value
@@ -253,7 +261,8 @@ def set_options(config: T, values: Mapping[str, Any]) -> T:
         else:
             changes.setdefault(path[0], {})[name] = value
     for group, inner in changes.items():
-        own[group] = set_options(getattr(config, group), inner)
+        before = groups[group] if group in groups else getattr(config, group)
+        own[group] = set_options(before, inner)
     return dataclasses.replace(config, **own) if own else config  # type: ignore[type-var]
 
 

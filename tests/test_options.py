@@ -280,3 +280,15 @@ def test_valid_options_that_make_no_sense_get_a_sentence(preset, options, senten
         assert said == []
     else:
         assert any(x.startswith(sentence) or sentence in x for x in said)
+
+
+def test_only_the_result_of_several_changes_must_fit_together():
+    small = train_config(replay_size=400, batch_size=8)
+    taught = {"teacher_batch_size": 16, "student_batch_size": 8}
+    config = set_train_options(small, {"algorithm": "distill", **taught})
+    assert (config.algorithm, config.algo.teacher_batch_size) == ("distill", 16)
+    assert config.replay.replay_size == 400
+    with pytest.raises(ValueError, match="replay_size must be at least teacher_batch_size = 512"):
+        set_train_options(small, {"algorithm": "distill"})
+    pushed = set_train_options(small, {"task": "push", "threshold": 0.02, "algorithm": "dqn"})
+    assert (pushed.env.task, pushed.env.task_options.threshold) == ("push", 0.02)
