@@ -191,7 +191,7 @@ def test_commands_of_the_pages_run(words: list[str], path: str, folder: pathlib.
     assert main(arguments) == 0
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_job_script_starts_a_run_and_continues_it(tmp_path: pathlib.Path):
     """The script of the page about Slurm, by bash."""
     script = ROOT / "docs" / "how-to" / "train.sbatch"

@@ -55,7 +55,7 @@ CONFIG = train_config(
 SPACE = (Dimension("task", choices=("never", "always")),)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_sweep_ranks_prunes_and_continues(tmp_path):
     first = sweep(CONFIG, SPACE, tmp_path / "sweep", trials=2, eval_episodes=2)
     assert [trial.number for trial in sorted(first, key=lambda trial: trial.number)] == [0, 1]

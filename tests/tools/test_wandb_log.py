@@ -103,7 +103,7 @@ def test_an_offline_run_has_metrics_options_and_results(tmp_path):
         assert found["summary"]["evaluation"]["successes"] == successes
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_training_is_logged_and_a_resumed_one_continues_there(tmp_path):
     folder = tmp_path / "run"
     options = (

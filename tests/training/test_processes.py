@@ -176,7 +176,7 @@ def test_one_process_is_no_meeting():
     assert not jax.distributed.is_initialized()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_run_of_two_processes_is_stopped_and_resumed_to_the_bit(tmp_path):
     whole, again, cut = (tmp_path / name for name in ("whole", "again", "cut"))
     for folder in (whole, again):
@@ -202,7 +202,7 @@ def test_a_run_of_two_processes_is_stopped_and_resumed_to_the_bit(tmp_path):
     assert names == sorted(path.name for path in cut.iterdir())
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("lost", [0, 1])
 def test_when_a_process_is_lost_the_others_end_and_the_run_resumes_with_one(lost, tmp_path):
     folder = tmp_path / "run"
@@ -224,7 +224,7 @@ def test_when_a_process_is_lost_the_others_end_and_the_run_resumes_with_one(lost
     assert [row["env_steps"] for row in read_metrics(folder)] == list(range(160, done + 321, 160))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_run_of_four_devices_is_resumed_to_the_bit_and_on_fewer(tmp_path):
     whole, cut = tmp_path / "whole", tmp_path / "cut"
 
