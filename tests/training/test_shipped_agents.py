@@ -13,19 +13,19 @@ AGENTS = pathlib.Path(__file__).parents[2] / "mjx_arm" / "agents"
 
 
 def test_each_shipped_agent_is_small_and_has_a_card():
-    assert "agent-b" in shipped_agents()
+    assert shipped_agents() == ["agent-a", "agent-b"]
     for name in shipped_agents():
         assert (AGENTS / f"{name}.safetensors").stat().st_size <= 3 * 2**20
         assert "of 1,000 held-out episodes" in (AGENTS / f"{name}.md").read_text()
 
 
 def test_an_unknown_agent_is_refused_with_the_names_of_those_shipped():
-    with pytest.raises(ValueError, match="or one of agent-b"):
+    with pytest.raises(ValueError, match="or one of agent-a, agent-b"):
         load_agent("agent-z")
 
 
 # Environment in which an agent is judged -> the least that its 95 % interval may begin with.
-LEAST = {"agent-b": ("B", 0.88)}
+LEAST = {"agent-a": ("A", 0.91), "agent-b": ("B", 0.88)}
 
 
 def judge(agent, apply, episodes):
