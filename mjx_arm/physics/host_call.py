@@ -10,8 +10,12 @@ small program that runs once in a process. Where they differ, `call` uses jax's 
 
 from __future__ import annotations
 
+import atexit
+import contextlib
 import ctypes
 import functools
+import math
+import time
 import traceback
 from collections.abc import Callable, Sequence
 from typing import Any, ClassVar
@@ -107,6 +111,9 @@ _Handler = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.POINTER(_Frame))
 # XLA holds their addresses for as long as the process lives.
 _handlers: dict[str, Any] = {}
 _functions: dict[str, HostFunction] = {}
+# When each was last called, seconds; and for so long there must be no call before Python ends.
+_last_call: dict[str, float] = {}
+_QUIET = 0.5
 
 
 def register(name: str, function: HostFunction) -> None:
@@ -137,6 +144,8 @@ def _register(name: str) -> None:
                 _functions[name](_array(frame.arguments), _array(frame.results))
         except BaseException:
             return _error(frame, traceback.format_exc())
+        finally:
+            _last_call[name] = time.monotonic()
         return None
 
     handler = _Handler(handle)
@@ -204,6 +213,8 @@ def usable() -> bool:
         device = jax.local_devices(backend="cpu")[0]
     except RuntimeError:
         return False
+    # Now that jax has a device, this comes before its own farewell.
+    atexit.register(_wait_for_calls)
     _functions[_PROBE] = lambda operand, result: np.copyto(result, operand + np.uint32(1))
     try:
         _register(_PROBE)
@@ -214,6 +225,18 @@ def usable() -> bool:
             return bool((np.asarray(probe(operand)) == operand + 1).all())
     except Exception:
         return False
+
+
+def _wait_for_calls() -> None:
+    """Waits until no program runs that calls Python, which would crash or hang once Python ends.
+
+    A program whose results nobody holds any more is known by its calls alone.
+    """
+    for array in jax.live_arrays():
+        with contextlib.suppress(Exception):  # it was donated, or its program failed
+            array.block_until_ready()
+    while time.monotonic() - max(_last_call.values(), default=-math.inf) < _QUIET:
+        time.sleep(0.02)
 
 
 def _same_layout(frame: _Frame) -> bool:

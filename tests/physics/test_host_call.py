@@ -38,6 +38,22 @@ hit = events.count("/jax/compilation_cache/cache_hits")
 print(hit, float(end.poses.site_xpos.sum()))
 """
 
+LEAVES = """
+import sys
+import jax
+import mjx_arm
+env = mjx_arm.make("A", observation="state", physics="native")
+_, state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), 64))
+def move(state, _):
+    return jax.vmap(env.transition, (0, None))(state, 3)[0], None
+run = jax.jit(lambda state: jax.lax.scan(move, state, None, length=1000)[0])
+run = run.lower(state).compile()
+end = run(state)
+if sys.argv[1] == "forgotten":
+    del end
+print("left")
+"""
+
 
 def _nothing(operand, result):
     raise AssertionError("the name should count")
@@ -151,3 +167,11 @@ def test_a_second_process_finds_the_program_of_the_first(tmp_path):
     ]
     assert [hit for hit, _ in done] == ["0", "1"]
     assert done[0][1] == done[1][1]
+
+
+@pytest.mark.parametrize("result", ["kept", "forgotten"])
+def test_a_process_that_ends_while_a_program_runs_ends_well(result):
+    done = subprocess.run(
+        [sys.executable, "-c", LEAVES, result], capture_output=True, text=True, timeout=120
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (0, "left\n", "")
