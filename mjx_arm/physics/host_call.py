@@ -111,9 +111,11 @@ _Handler = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.POINTER(_Frame))
 # XLA holds their addresses for as long as the process lives.
 _handlers: dict[str, Any] = {}
 _functions: dict[str, HostFunction] = {}
-# When each was last called, seconds; and for so long there must be no call before Python ends.
+# When each was last called, seconds.
 _last_call: dict[str, float] = {}
-_QUIET = 0.5
+# Before Python ends: a program that runs makes its first call within this time, and the next one
+# within that, seconds.
+_FIRST, _NEXT = 0.5, 2.0
 
 
 def register(name: str, function: HostFunction) -> None:
@@ -235,8 +237,13 @@ def _wait_for_calls() -> None:
     for array in jax.live_arrays():
         with contextlib.suppress(Exception):  # it was donated, or its program failed
             array.block_until_ready()
-    while time.monotonic() - max(_last_call.values(), default=-math.inf) < _QUIET:
+    begun = time.monotonic()
+    quiet_from = begun + _FIRST
+    while time.monotonic() < quiet_from:
         time.sleep(0.02)
+        last = max(_last_call.values(), default=-math.inf)
+        if last > begun:
+            quiet_from = last + _NEXT
 
 
 def _same_layout(frame: _Frame) -> bool:
