@@ -20,7 +20,7 @@ import dataclasses
 import json
 import math
 import pathlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import jax
@@ -95,49 +95,47 @@ def difference(one: Evaluation, other: Evaluation) -> dict[str, Any]:
     return {"percent": 100 * gap, "ci95": [100 * (gap - half), 100 * (gap + half)]}
 
 
-def measure(name: str, only: str | None) -> dict[str, Any]:
-    """The row of one agent."""
+def measure(name: str, only: str | None) -> Iterator[dict[str, Any]]:
+    """The figures of one agent, as they are taken."""
     own = mjx_arm.load_agent(name).trained_env.env
-    row: dict[str, Any] = {"agent": name, "trained_in": own, "epsilon": EPSILON}
+    yield {"trained_in": own, "epsilon": EPSILON}
     for env in ("A", "B"):
         if only in (None, env):
             result = judge(mjx_arm.load_agent(name, env=env), EPISODES)
-            row[f"in_{env}"] = dataclasses.asdict(result)
-            print(f"{name} in {env}: {100 * result.rate:.1f} %", flush=True)
+            yield {f"in_{env}": dataclasses.asdict(result)}
     if only not in (None, own):
-        return row
+        return
     native = mjx_arm.load_agent(name, env=own, physics="native")
-    mjx = mjx_arm.load_agent(name, env=own, physics="mjx")
-    by_native, by_mjx = judge(native, FEW), judge(mjx, FEW)
-    row["native"], row["mjx"] = dataclasses.asdict(by_native), dataclasses.asdict(by_mjx)
-    row["mjx_minus_native"] = difference(by_mjx, by_native)
     for key, scripted in (("agent", False), ("scripted", True)):
         found = lengths(native, scripted=scripted)
-        row[f"median_length_{key}"] = float(np.median(found))
-        row[f"successes_{key}"] = len(found)
-    row["blank_image"] = judge(
-        native, FEW, lambda p, obs: native.apply(p, jnp.zeros_like(obs))
-    ).rate
+        yield {f"median_length_{key}": float(np.median(found)), f"successes_{key}": len(found)}
+    blank = judge(native, FEW, lambda p, obs: native.apply(p, jnp.zeros_like(obs)))
     other = judge(native, FEW, lambda p, obs: native.apply(p, jnp.roll(obs, 1, axis=0)))
-    row["image_of_another_episode"] = other.rate
-    return row
+    yield {"blank_image": blank.rate, "image_of_another_episode": other.rate}
+    mjx = mjx_arm.load_agent(name, env=own, physics="mjx")
+    by_native, by_mjx = judge(native, FEW), judge(mjx, FEW)
+    yield {
+        "native": dataclasses.asdict(by_native),
+        "mjx": dataclasses.asdict(by_mjx),
+        "mjx_minus_native": difference(by_mjx, by_native),
+    }
 
 
 def main() -> None:
-    """Judges the agents, prints what it finds and, where asked to, writes the file."""
+    """Judges the agents, prints each figure and, where asked to, writes it as it comes."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("agents", nargs="+", help="names of shipped agents, files or run folders")
     parser.add_argument("--env", choices=("A", "B"), help="only in this environment")
     parser.add_argument("--json", type=pathlib.Path, help="file to add the results to")
     options = parser.parse_args()
     for name in options.agents:
-        row = {**measure(name, options.env), "machine": machine()}
-        shown = {k: v for k, v in row.items() if not isinstance(v, dict) or "percent" in v}
-        print(json.dumps(shown), flush=True)
-        if options.json:
-            rows = json.loads(options.json.read_text()) if options.json.is_file() else {}
-            rows[name] = row
-            options.json.write_text(json.dumps(rows, indent=1) + "\n")
+        row: dict[str, Any] = {"machine": machine()}
+        for figures in measure(name, options.env):
+            print(name, json.dumps(figures), flush=True)
+            row |= figures
+            if options.json:
+                rows = json.loads(options.json.read_text()) if options.json.is_file() else {}
+                options.json.write_text(json.dumps(rows | {name: row}, indent=1) + "\n")
 
 
 if __name__ == "__main__":

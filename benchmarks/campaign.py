@@ -221,7 +221,8 @@ def disks(folder: pathlib.Path, scale: float) -> Iterator[Row]:
                 continue
             _mount(mount, 4 * size // 1024, "remount,size")
             begun = (mount / "run/config.json").is_file()
-            shutil.rmtree(mount / "run", ignore_errors=True) if not begun else None
+            if not begun:
+                shutil.rmtree(mount / "run", ignore_errors=True)
             again = ("--resume", mount / "run", "--eval-episodes", "4")
             done = _run(command(*again) if begun else command(*options, "--out", mount / "run"))
             good = done.returncode == 0 and fingerprint(mount / "run") == wanted
@@ -252,32 +253,22 @@ def flips(folder: pathlib.Path, scale: float) -> Iterator[Row]:
     def row(what: str, wanted: str) -> Row:
         return Row("flips", f"one bit of {what}", wanted)
 
-    agents = row("an agent", "refused in one sentence")
-    agent = whole / "last.safetensors"
-    for place in _places(agent, rng, round(200 * scale)):
-        with _flipped(agent, place):
-            status, _, error = in_process("eval", agent, "--episodes", "1")
-            agents.expect(is_sentence(status, error), f"bit {place}: exit {status}, {error}")
+    refused, agent, config = (
+        "refused in one sentence",
+        whole / AGENT_FILES[0],
+        whole / "config.json",
+    )
+    agents, checkpoints = row("an agent", refused), row("the newest checkpoint", refused)
+    configs = row("config.json", refused)
+    _flip_each(agents, agent, _places(agent, rng, round(200 * scale)), "eval", agent)
     yield agents
-
-    checkpoints = row("the newest checkpoint", "refused in one sentence")
     newest = sorted((whole / "checkpoints").iterdir())[-1]
     files = [path for path in newest.rglob("*") if path.is_file() and path.stat().st_size]
-    for _ in range(round(100 * scale)):
-        path = rng.choice(files)
-        (place,) = _places(path, rng, 1)
-        with _flipped(path, place):
-            status, _, error = in_process("train", "--resume", whole, *more)
-            said = is_sentence(status, error)
-            checkpoints.expect(said, f"{path.name}, bit {place}: exit {status}, {error}")
+    for path in rng.choices(files, k=max(1, round(100 * scale))):
+        _flip_each(checkpoints, path, _places(path, rng, 1), "train", "--resume", whole, *more)
     yield checkpoints
-
-    configs = row("config.json", "refused in one sentence")
-    config = whole / "config.json"
-    for place in _places(config, rng, round(100 * scale)):
-        with _flipped(config, place):
-            status, _, error = in_process("train", "--resume", whole, *more)
-            configs.expect(is_sentence(status, error), f"bit {place}: exit {status}, {error}")
+    places = _places(config, rng, round(100 * scale))
+    _flip_each(configs, config, places, "train", "--resume", whole, *more)
     yield configs
 
     metrics = row("metrics.jsonl", "a damaged line is named; a changed digit is out of scope")
@@ -304,6 +295,18 @@ def flips(folder: pathlib.Path, scale: float) -> Iterator[Row]:
         pictures.expect(status == 0, f"exit {status}, {error}")
         shutil.rmtree(own)
     yield pictures
+
+
+def _flip_each(
+    row: Row, path: pathlib.Path, places: list[int], *command: str | pathlib.Path
+) -> None:
+    """Flips each bit of a file alone; the command must refuse the file each time."""
+    for place in places:
+        with _flipped(path, place):
+            status, _, error = in_process(*command)
+            row.expect(
+                is_sentence(status, error), f"{path.name}, bit {place}: exit {status}, {error}"
+            )
 
 
 def _places(path: pathlib.Path, rng: random.Random, count: int) -> list[int]:

@@ -57,8 +57,8 @@ from mjx_arm.training.run_folder import (
 from mjx_arm.training.runner import RunInterruptedError, resume, stop_signals, train
 from mjx_arm.view.viewer import ViewOptions, view
 
-# Options that may change when a run is resumed.
 _PROCESSES = ("coordinator", "num_processes", "process_id")
+# Options that may change when a run is resumed.
 _CHANGEABLE = frozenset(
     {"resume", "total_steps", "eval_episodes", "stop_at", "wandb", "devices", *_PROCESSES}
 )
@@ -78,8 +78,8 @@ class Train:
         of a run.
       options: options of the run.
       out: folder for everything the run leaves; by default `runs/` and the time.
-      resume: folder of a run to continue; only `--total-steps`, `--eval-episodes`, `--stop-at` and
-        the number of devices and processes may then be given.
+      resume: folder of a run to continue; only `--total-steps`, `--eval-episodes`, `--stop-at`,
+        `--wandb` and the number of devices and processes may then be given.
       init_from: an agent or a run folder whose network the run starts from.
       stop_at: end the run when an evaluation that selects has reached this success rate.
       eval_episodes: episodes of the evaluation at the end, by the best agent, at epsilon 0.1 and on
@@ -372,39 +372,22 @@ class Agents:
 
 
 @dataclasses.dataclass(frozen=True)
-class View:
+class View(ViewOptions):
     """Watch an agent in the browser: its Q-values, what it sees; step, push the cube by hand.
 
     An agent of a run that still trains is loaded again as often as the run saves it.
 
     Attributes:
       subject: an agent, a run folder, or the name or path of a scene.
-      env: environment, `A` or `B`; by default the agent's own, and `A` for a scene.
-      task: of a scene; by default the one that the scene was made for.
-      physics: backend; by default native on a CPU and mjx on other devices.
-      seed: of the first episode.
-      epsilon: share of random actions.
-      max_steps: iterations until an episode is truncated.
-      host: address to listen on. Whoever reaches an address other than 127.0.0.1 can work the
-        viewer.
-      port: to listen on.
     """
 
     subject: tyro.conf.Positional[pathlib.Path]
-    env: str | None = None
-    task: str | None = None
-    physics: str | None = None
-    seed: int = 0
-    epsilon: float = 0.1
-    max_steps: int = 1_000
-    host: str = "127.0.0.1"
-    port: int = 8080
 
     def run(self, given: frozenset[str]) -> None:
         """Runs the command."""
         del given
         check_device()
-        view(ViewOptions(**dataclasses.asdict(self)))
+        view(self)
 
 
 Command = Train | Eval | Play | Figures | Compare | Agents | View | Sweep
@@ -435,8 +418,11 @@ def default_preset() -> str:
 Trains = TypeVar("Trains", Train, Sweep)
 
 
-def _start(kind: type[Trains], arguments: Sequence[str]) -> Trains:
-    """The options that a command line starts from: those of its preset or file, and its task's."""
+def _start(kind: type[Trains], arguments: Sequence[str]) -> tuple[Trains, dict[str, str]]:
+    """What a command line starts from: its preset or file, and its task and algorithm by name.
+
+    These two decide which options there are.
+    """
     first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     for name in ("preset", "config", "task", "algorithm"):
         first.add_argument(f"--{name}", nargs="?")
@@ -450,7 +436,7 @@ def _start(kind: type[Trains], arguments: Sequence[str]) -> Trains:
         options = parse_run(read_text(pathlib.Path(known.config)), known.config).config
     parts = {"task": known.task, "algorithm": known.algorithm}
     chosen = {name: value for name, value in parts.items() if value is not None}
-    return kind(options=set_train_options(options, chosen), preset=preset)
+    return kind(options=options, preset=preset), chosen
 
 
 def _parse(arguments: Sequence[str]) -> tuple[Command, frozenset[str]]:
@@ -501,9 +487,11 @@ def _join(arguments: Sequence[str]) -> None:
 def _parse_train(kind: type[Trains], arguments: Sequence[str]) -> tuple[Trains, frozenset[str]]:
     if kind is Train:
         _join(arguments)
-    start = _start(kind, arguments)
+    start, chosen = _start(kind, arguments)
     own = {name: x for name, x in _annotations(kind).items() if name != "options"}
-    values, others = read_arguments(arguments, own | flat_annotations(start.options))
+    # Of the defaults, since the options of the start may fit the others on the command line alone.
+    known = flat_annotations(set_train_options(TrainConfig(), _kinds_of(start.options) | chosen))
+    values, others = read_arguments(arguments, own | known)
     _check_none(others)
     options = {name: value for name, value in values.items() if name not in own}
     rest = {name: value for name, value in values.items() if name in own}
@@ -512,6 +500,16 @@ def _parse_train(kind: type[Trains], arguments: Sequence[str]) -> tuple[Trains, 
         dataclasses.replace(start, options=set_train_options(start.options, options)),
         frozenset(values),
     )
+
+
+def _kinds_of(options: TrainConfig) -> dict[str, str]:
+    return {"task": options.env.task, "algorithm": options.algorithm}
+
+
+def _help_of(kind: type[Trains], arguments: Sequence[str]) -> Trains:
+    """The command with the values that its help shows."""
+    start, chosen = _start(kind, arguments)
+    return dataclasses.replace(start, options=set_train_options(start.options, chosen))
 
 
 def _annotations(kind: type) -> dict[str, Any]:
@@ -525,8 +523,8 @@ def _check_none(others: Sequence[str]) -> None:
 
 def _help(arguments: Sequence[str]) -> NoReturn:
     """Prints the help, which shows the values of the preset, and the options of the task."""
-    train_ = Annotated[Train, tyro.conf.subcommand("train", default=_start(Train, arguments))]
-    sweep_ = Annotated[Sweep, tyro.conf.subcommand("sweep", default=_start(Sweep, arguments))]
+    train_ = Annotated[Train, tyro.conf.subcommand("train", default=_help_of(Train, arguments))]
+    sweep_ = Annotated[Sweep, tyro.conf.subcommand("sweep", default=_help_of(Sweep, arguments))]
     commands: Any = train_ | Eval | Play | Figures | Compare | Agents | View | sweep_
     first = [name for name in arguments[:1] if name in _COMMANDS]
     tyro.cli(

@@ -393,6 +393,8 @@ def parse_config(text: str, where: str) -> TrainConfig:
     algorithm = _text(values, "algorithm", "dqn", where)
     check_name(f"algorithm in {where}:", algorithm, _ALGORITHMS)
     env_values = values.pop("env", {})
+    if isinstance(env_values, dict):  # what the file leaves out is as training has it
+        env_values = to_json(train_env_config(task=task)) | env_values
     env = from_json(
         EnvConfig, env_values, f"{where}, 'env'", {"task_options": find_task(task).config}
     )

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import re
 
 import pytest
 
 from mjx_arm.arguments import read_arguments
 from mjx_arm.cli import Train, _annotations, _parse, main
+from mjx_arm.config import dump_config, train_config
 from mjx_arm.options import flat_names
 from mjx_arm.presets import PRESETS
 
@@ -106,3 +108,14 @@ def test_the_help_lists_the_options_that_the_command_line_takes(preset, capsys):
     taken = {f"--{name.replace('_', '-')}" for name in names}
     assert taken <= listed
     assert {x for x in listed - taken if not x.startswith("--no-")} == {"--help"}
+
+
+def test_another_algorithm_need_only_fit_together_with_the_other_options(tmp_path):
+    file = tmp_path / "small.json"
+    file.write_text(json.dumps(dump_config(train_config(replay_size=400, batch_size=8))))
+    line = f"train --config {file} --algorithm distill --teacher-batch-size 16"
+    command, _ = _parse([*line.split(), "--student-batch-size", "8"])
+    assert isinstance(command, Train)
+    assert (command.options.algorithm, command.options.replay.replay_size) == ("distill", 400)
+    with pytest.raises(ValueError, match="replay_size must be at least student_batch_size = 500"):
+        _parse([*line.split(), "--student-batch-size", "500"])

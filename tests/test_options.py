@@ -292,3 +292,10 @@ def test_only_the_result_of_several_changes_must_fit_together():
         set_train_options(small, {"algorithm": "distill"})
     pushed = set_train_options(small, {"task": "push", "threshold": 0.02, "algorithm": "dqn"})
     assert (pushed.env.task, pushed.env.task_options.threshold) == ("push", 0.02)
+
+
+def test_what_a_file_leaves_out_is_as_training_has_it():
+    text = '{"format": 2, "replay": {"replay_size": 400}, "algo": {"batch_size": 8}}'
+    assert parse_config(text, "c.json") == train_config(replay_size=400, batch_size=8)
+    text = '{"format": 2, "env": {"task": "push", "env": "B"}}'
+    assert parse_config(text, "c.json") == train_config(task="push", env="B")

@@ -111,10 +111,10 @@ _Handler = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.POINTER(_Frame))
 # XLA holds their addresses for as long as the process lives.
 _handlers: dict[str, Any] = {}
 _functions: dict[str, HostFunction] = {}
-# When each was last called, seconds.
+# When each last returned, seconds of the monotonic clock.
 _last_call: dict[str, float] = {}
-# Before Python ends: a program that runs makes its first call within this time, and the next one
-# within that, seconds.
+# A program that still runs when Python ends is taken to make a call within the first time, and its
+# next call within the second, both in seconds.
 _FIRST, _NEXT = 0.5, 2.0
 
 
@@ -143,11 +143,9 @@ def _register(name: str) -> None:
             if frame.extension and frame.extension.contents.type == _METADATA:
                 _describe(frame)
             elif name != _PROBE or _same_layout(frame):
-                _functions[name](_array(frame.arguments), _array(frame.results))
+                _run(name, _functions[name], _array(frame.arguments), _array(frame.results))
         except BaseException:
             return _error(frame, traceback.format_exc())
-        finally:
-            _last_call[name] = time.monotonic()
         return None
 
     handler = _Handler(handle)
@@ -203,9 +201,16 @@ def _call_on_cpu(
 
     def in_place(context: Any, out: Any, rows: Any) -> None:
         del context
-        function(np.asarray(rows), np.asarray(out))
+        _run(name, function, np.asarray(rows), np.asarray(out))
 
     return buffer_callback(in_place, result, vmap_method="broadcast_all")(operand)
+
+
+def _run(name: str, function: HostFunction, operand: np.ndarray, result: np.ndarray) -> None:
+    try:
+        function(operand, result)
+    finally:
+        _last_call[name] = time.monotonic()
 
 
 @functools.cache
@@ -215,7 +220,7 @@ def usable() -> bool:
         device = jax.local_devices(backend="cpu")[0]
     except RuntimeError:
         return False
-    # Now that jax has a device, this comes before its own farewell.
+    # Registered after jax has made its device, so that it runs before jax lets go of that.
     atexit.register(_wait_for_calls)
     _functions[_PROBE] = lambda operand, result: np.copyto(result, operand + np.uint32(1))
     try:

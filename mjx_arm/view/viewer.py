@@ -47,14 +47,15 @@ class ViewOptions:
     """What the viewer is asked for.
 
     Attributes:
-      subject: a run folder, an agent, or a scene.
-      env: environment, `A` or `B`; by default the agent's own, and A for a scene.
-      task: of a scene.
-      physics: backend.
+      subject: an agent, a run folder, or the name or path of a scene.
+      env: environment, `A` or `B`; by default the agent's own, and `A` for a scene.
+      task: of a scene; by default the one that the scene was made for.
+      physics: backend; by default native on a CPU and mjx on other devices.
       seed: of the first episode.
       epsilon: share of random actions.
       max_steps: iterations until an episode is truncated.
-      host: address to listen on.
+      host: address to listen on. Whoever reaches an address other than 127.0.0.1 can use the
+        viewer.
       port: to listen on.
     """
 
