@@ -87,7 +87,7 @@ class Train:
       wandb: also log the run to Weights & Biases; `WANDB_MODE=offline` keeps it in the run folder.
       devices: number of local devices that share the work; by default as many as divide it.
       coordinator: `HOST:PORT` of process 0, where several processes train one run; each gets the
-        same command but for its number. Slurm, Open MPI and Kubernetes say all three themselves.
+        same command with its own number. Under Slurm, Open MPI and Kubernetes leave all three out.
       num_processes: number of processes of the run.
       process_id: number of this process, from 0.
     """

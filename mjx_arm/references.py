@@ -27,8 +27,8 @@ def reference_to(value: Any) -> str:
 def has_lasting_source(value: Any) -> bool:
     """Whether another process can have the same object: it has a name of its own in a file.
 
-    A lambda, a function inside a function and a `functools.partial` have none: what they enclose is
-    not in their source.
+    It cannot have a lambda, a function inside a function or a `functools.partial`: the values that
+    these enclose are not in their source.
     """
     if isinstance(value, functools.partial) or any(part in reference_to(value) for part in _LOCAL):
         return False
