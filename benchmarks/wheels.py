@@ -4,7 +4,7 @@
     python benchmarks/wheels.py DIR --install                      # without one: install
 
 The machine is a Linux x86-64 with jax for CUDA, flax, optax and chex already there, as NVIDIA's and
-Google's images have them. This script fetches the other packages that training needs, without orbax,
+Google's images have them. The script fetches what else training needs, without orbax,
 imageio-ffmpeg, tensorboardX, gymnasium and matplotlib, which `gpu.py` does without. Pip resolves
 them and checks their digests. Wheels of more than 40 MiB are cut into parts.
 """
