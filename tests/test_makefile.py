@@ -94,3 +94,15 @@ def test_play_records_an_agent(venv: Path) -> None:
     (venv / ".locked-cpu").touch()
     lines = make("--dry-run", "play", f"VENV={venv}", "ARGS=--env A").stdout.splitlines()
     assert lines[-1] == f"{venv}/bin/mjx-arm play agent-b --env A"
+
+
+def test_the_peers_tests_are_all_in_the_files_that_are_run_for_them() -> None:
+    """The others may import what the peers' environment lacks, so they are not even read there."""
+    named = make("--print-data-base", "--question", "help").stdout
+    places = next(line for line in named.splitlines() if line.startswith("PEERS_TESTS := "))
+    folders = [ROOT / place for place in places.removeprefix("PEERS_TESTS := ").split()]
+    marked = [path for path in (ROOT / "tests").rglob("*.py") if "mark.peers" in path.read_text()]
+    marked.remove(Path(__file__))
+    assert marked
+    for path in marked:
+        assert any(path.is_relative_to(folder) for folder in folders), path
