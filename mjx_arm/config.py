@@ -164,11 +164,13 @@ class DistillConfig(AlgorithmConfig):
       student_batch_size: images in one update of the student.
       student_updates_per_step: updates of the student after each step of all environments.
       student_learning_rate: of the student's Adam.
+      student_decay_steps: environment steps, from the student's first update on, over which that
+        rate falls by a cosine to a twentieth; 0: it stays.
       student_polyak: share of the newest parameters in each update of the averaged ones, which act
         and are judged.
       student_share: share of the environments that the student drives, once it learns.
       student_temperature: of the softmax over advantages that the student imitates, in units of
-        their standard deviation.
+        their standard deviation in the state.
     """
 
     n_step: Count = 5
@@ -180,6 +182,7 @@ class DistillConfig(AlgorithmConfig):
     student_batch_size: Count = 64
     student_updates_per_step: Count = 3
     student_learning_rate: Positive = 1e-3
+    student_decay_steps: CountOrZero = 0
     student_polyak: Share = 0.005
     student_share: Share = 0.5
     student_temperature: Positive = 0.5

@@ -34,6 +34,11 @@ _STUDENT_METRICS: dict[str, str] = dict.fromkeys(
 _WARM_UP = 100_000
 # The spread of the teacher's advantages is averaged over about this number of updates.
 _SPREAD_UPDATES = 1_000
+# Share of the student's learning rate that is left at the end of its decay.
+_LAST_RATE = 0.05
+# A state whose advantages spread by less than this share of the running mean counts as if they did
+# by that much.
+_LEAST_SPREAD = 0.1
 # Weight of the squared error of the mean Q-value beside the cross-entropy.
 _VALUE_WEIGHT = 0.1
 
@@ -109,7 +114,13 @@ class Distill:
 
     @property
     def _optimizer(self) -> optax.GradientTransformation:
-        return optax.adam(self.config.student_learning_rate)
+        config = self.config
+        if not config.student_decay_steps:
+            return optax.adam(config.student_learning_rate)
+        steps = max(1, config.student_decay_steps // self.num_envs)
+        updates = steps * config.student_updates_per_step
+        rate = optax.cosine_decay_schedule(config.student_learning_rate, updates, _LAST_RATE)
+        return optax.adam(rate)
 
     def acts_on_obs(self, env_steps: jax.Array) -> jax.Array:
         """Whether the student drives its share of the environments already."""
@@ -193,17 +204,17 @@ class Distill:
           The student after, its loss, and the share of the states in which both prefer the same
           action.
         """
-        advantage = target - jnp.mean(target, axis=-1, keepdims=True)
-        power = self.shard.mean(jnp.mean(jnp.square(advantage)))
+        power = self.shard.mean(jnp.mean(jnp.var(target, axis=-1)))
         rate = 1.0 / _SPREAD_UPDATES
         spread = (1 - rate) * student.spread + rate * jnp.sqrt(power + 1e-10)
         parts = num_microbatches(len(target))
         rows = jax.tree.map(lambda x: x.reshape(parts, -1, *x.shape[1:]), (obs, target))
-        temperature = self.config.student_temperature * spread
+        least = _LEAST_SPREAD * spread
 
         def loss_of(params: Params, obs: Obs, target: jax.Array) -> tuple[jax.Array, jax.Array]:
             q = self.apply(params, obs)
-            losses = jax.vmap(imitation_loss, in_axes=(0, 0, None))(q, target, temperature)
+            temperature = self.config.student_temperature * advantage_spread(target, least)
+            losses = jax.vmap(imitation_loss)(q, target, temperature)
             agree = jnp.argmax(q, axis=-1) == jnp.argmax(target, axis=-1)
             return jnp.mean(losses), jnp.mean(agree.astype(jnp.float32))
 
@@ -221,6 +232,20 @@ class Distill:
         averaged = optax.incremental_update(params, student.averaged, self.config.student_polyak)
         metrics = {"student_loss": jnp.mean(losses), "student_agreement": jnp.mean(agreements)}
         return Student(params, opt_state, averaged, spread), self.shard.mean(metrics)
+
+
+def advantage_spread(target: jax.Array, least: jax.Array) -> jax.Array:
+    """Standard deviation of each state's advantages, `[B] float32`, but no less than `least`.
+
+    Far from success all actions are worth nearly the same: the median state has a fifth of the root
+    mean square over all states. With one temperature for all of them the student would hardly learn
+    which action is the best there.
+
+    Args:
+      target: `[B, A] float32`, Q-values.
+      least: `[] float32`: differences far below it are the teacher's own errors.
+    """
+    return jnp.maximum(jnp.std(target, axis=-1), least)
 
 
 def imitation_loss(q: jax.Array, target: jax.Array, temperature: jax.Array) -> jax.Array:

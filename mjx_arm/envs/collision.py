@@ -8,6 +8,7 @@ not take is blocked before it is given.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import itertools
 from collections.abc import Callable, Sequence
 from typing import Any, TypeAlias
@@ -103,8 +104,58 @@ class Collision:
           commanded: poses of `geoms` alone, with the arm's joints where the command would have
             them.
         """
-        before, after = self.clearances(now), self.clearances_of_geoms(commanded)
-        return jnp.any((after < np.float32(self.margin)) & (after < before - np.float32(_SAME)))
+        blocked: jax.Array = self._is_blocked_many(now, commanded)
+        return blocked
+
+    @functools.cached_property
+    def _is_blocked_many(self) -> Callable[[Poses, Poses], jax.Array]:
+        @_called_once
+        def blocked(now: Poses, commanded: Poses) -> jax.Array:
+            after = jax.vmap(self.clearances_of_geoms)(commanded)
+            near = after < np.float32(self.margin)
+
+            def closer() -> jax.Array:
+                return near & (after < jax.vmap(self.clearances)(now) - np.float32(_SAME))
+
+            # In most steps no arm of the batch is near anything.
+            return jnp.any(jax.lax.cond(jnp.any(near), closer, lambda: near), axis=-1)
+
+        return blocked
+
+
+def _called_once(function: Callable[..., jax.Array]) -> Callable[..., jax.Array]:
+    """A function of batches as one of single arguments, called under vmap once with all rows."""
+
+    @jax.custom_batching.custom_vmap
+    def single(*arguments: Any) -> jax.Array:
+        return function(*jax.tree.map(lambda x: x[None], arguments))[0]
+
+    @single.def_vmap
+    def batch(size: int, is_batched: list[Any], *arguments: Any) -> tuple[jax.Array, bool]:
+        return many(*_repeated(size, is_batched, arguments)), True
+
+    @jax.custom_batching.custom_vmap
+    def many(*arguments: Any) -> jax.Array:
+        return function(*arguments)
+
+    @many.def_vmap
+    def batch_of_many(size: int, is_batched: list[Any], *arguments: Any) -> tuple[jax.Array, bool]:
+        arguments = _repeated(size, is_batched, arguments)
+        flat = jax.tree.map(lambda x: x.reshape(size * x.shape[1], *x.shape[2:]), arguments)
+        found = many(*flat)
+        return found.reshape(size, -1, *found.shape[1:]), True
+
+    return single
+
+
+def _repeated(size: int, is_batched: list[Any], arguments: tuple[Any, ...]) -> tuple[Any, ...]:
+    """The arguments with a first axis each, also where vmap gave them none."""
+    repeated: tuple[Any, ...] = jax.tree.map(
+        lambda x, has_axis: x if has_axis else jnp.broadcast_to(x, (size, *x.shape)),
+        arguments,
+        tuple(is_batched),
+    )
+    return repeated
 
 
 def make_self_collision(
@@ -197,7 +248,6 @@ def _make_clearances(
     used = slice(None) if take is None else take
     first, second = rows.reshape(-1, 2).T
 
-    @jax.custom_batching.custom_vmap
     def many(xpos: jax.Array, xmat: jax.Array) -> jax.Array:
         """`[N, ngeom, 3]` and `[N, ngeom, 3, 3]` to `[N, P]`."""
         pos = _computed_once(jnp.transpose(xpos, (2, 1, 0))[:, used])
@@ -210,23 +260,12 @@ def _make_clearances(
         solid = _between(one[planes:], other[planes:])
         return jnp.concatenate([flat, solid]).T
 
-    @many.def_vmap
-    def many_more(
-        size: int, batched: list[bool], xpos: jax.Array, xmat: jax.Array
-    ) -> tuple[jax.Array, bool]:
-        xpos, xmat = (
-            x if is_batched else jnp.broadcast_to(x, (size, *x.shape))
-            for x, is_batched in zip((xpos, xmat), batched, strict=True)
-        )
-        count = size * xpos.shape[1]
-        found = many(xpos.reshape(count, *xpos.shape[2:]), xmat.reshape(count, *xmat.shape[2:]))
-        return found.reshape(size, -1, len(pairs)), True
+    once = _called_once(many)
 
     def clearances(poses: Poses) -> jax.Array:
         if not len(pairs):
             return jnp.full((1,), jnp.inf, jnp.float32)
-        found: jax.Array = many(poses.geom_xpos[None], poses.geom_xmat[None])
-        return found[0]
+        return once(poses.geom_xpos, poses.geom_xmat)
 
     return clearances
 

@@ -10,7 +10,7 @@ import optax
 import pytest
 
 from mjx_arm.algos import distill
-from mjx_arm.algos.distill import Distill, Student, imitation_loss
+from mjx_arm.algos.distill import Distill, Student, advantage_spread, imitation_loss
 from mjx_arm.algos.dqn import QLearning
 from mjx_arm.algos.frames import Frames
 from mjx_arm.algos.replay import sample
@@ -111,6 +111,24 @@ def test_loss_is_least_at_the_target():
             assert loss > imitation_loss(target, target, jnp.float32(0.2))
 
 
+def test_the_spread_of_each_state_by_hand():
+    target = jnp.asarray([[0.0, 3.0, -3.0], [5.0, 5.3, 4.7], [1.0, 1.0, 1.0]])
+    expected = [np.sqrt(6.0), np.sqrt(0.06), 0.1]
+    np.testing.assert_allclose(advantage_spread(target, jnp.float32(0.1)), expected, rtol=1e-5)
+
+
+def test_a_state_of_small_advantages_weighs_as_much_as_one_of_large_ones():
+    """The loss of a student that prefers nothing is the same in both."""
+    toy = make_toy()
+    student = toy_student(toy)
+    obs = jnp.zeros((1, 4))  # the bias alone answers: equal Q-values
+    large = jnp.asarray([[1.0, 0.0, -1.0]])
+    losses = [
+        float(toy.imitate(student, obs, scale * large)[1]["student_loss"]) for scale in (1.0, 0.1)
+    ]
+    assert losses[0] == pytest.approx(losses[1], rel=1e-3)
+
+
 def test_ranks_are_asserted():
     with pytest.raises(AssertionError):
         imitation_loss(jnp.zeros((2, 3)), jnp.zeros(3), jnp.zeros(()))
@@ -164,6 +182,28 @@ def test_updates_move_the_student_to_the_teacher():
     assert differs(student.params, student.averaged)
     chosen = jnp.argmax(toy.apply(student.averaged, obs), axis=-1)
     assert float(jnp.mean(chosen == jnp.argmax(target, axis=-1))) > 0.95
+
+
+def test_the_students_learning_rate_falls_by_a_cosine():
+    # 40 environment steps of 8 environments, 2 updates each: 10 updates.
+    toy = make_toy(student_learning_rate=0.02, student_decay_steps=40, student_updates_per_step=2)
+    plain = make_toy(student_learning_rate=0.02)
+    obs = jax.random.normal(jax.random.key(1), (8, 4))
+    target = 100.0 * jax.random.normal(jax.random.key(2), (8, 3))
+    falling, steady = toy_student(toy), toy_student(plain)
+
+    def change(before: Student, after: Student) -> float:
+        gaps = jax.tree.map(lambda a, b: jnp.max(jnp.abs(a - b)), before.params, after.params)
+        return max(float(x) for x in jax.tree.leaves(gaps))
+
+    for update in range(12):
+        # The same gradients and moments: the two steps differ by the rate alone.
+        start = dataclasses.replace(falling, params=steady.params, averaged=steady.averaged)
+        falling, _ = toy.imitate(start, obs, target)
+        after, _ = plain.imitate(steady, obs, target)
+        share = 0.05 + 0.95 * 0.5 * (1 + np.cos(np.pi * min(update, 10) / 10))
+        assert change(start, falling) == pytest.approx(share * change(steady, after), rel=1e-3)
+        steady = after
 
 
 def test_the_spread_follows_the_teachers_advantages():

@@ -159,6 +159,31 @@ def test_nested_vmap_and_scan_give_the_same():
     np.testing.assert_allclose(one, flat[2], atol=1e-6)
 
 
+def test_commands_of_a_batch_are_blocked_one_by_one():
+    model = models()["arm_cube"]
+    collision, kinematics = make_self_collision(model), make_kinematics(model)
+    qpos = jnp.asarray(random_poses(model)[:64])
+    # Some come nearer to something, others go away from it.
+    arm = qpos.at[:, : model.nu].add(jnp.where(jnp.arange(64) % 2 == 0, 0.1, -0.1)[:, None])
+    now, commanded = (jax.vmap(kinematics)(x) for x in (qpos, arm))
+    links = commanded.replace(
+        geom_xpos=commanded.geom_xpos[:, collision.geoms],
+        geom_xmat=commanded.geom_xmat[:, collision.geoms],
+    )
+    before, after = (np.asarray(jax.vmap(collision.clearances)(x)) for x in (now, commanded))
+    wanted = ((after < collision.margin) & (after < before - 5e-6)).any(axis=-1)
+    assert 5 < wanted.sum() < 59
+    batch = jax.jit(jax.vmap(collision.is_blocked))(now, links)
+    np.testing.assert_array_equal(batch, wanted)
+    nested = jax.tree.map(lambda x: x.reshape(4, 16, *x.shape[1:]), (now, links))
+    twice = jax.jit(jax.vmap(jax.vmap(collision.is_blocked)))(*nested)
+    np.testing.assert_array_equal(twice.reshape(-1), wanted)
+    free = np.flatnonzero(~(after < collision.margin).any(axis=-1))[0]
+    for index in (free, np.flatnonzero(wanted)[0]):
+        row = jax.tree.map(lambda x, index=index: x[index], (now, links))
+        assert jax.jit(collision.is_blocked)(*row) == wanted[index]
+
+
 def test_a_home_that_collides_is_refused():
     model = models()["arm_cube"]
     home = model.key_qpos[0].copy()
