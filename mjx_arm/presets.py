@@ -46,6 +46,7 @@ PRESETS: dict[str, TrainConfig] = {
         total_steps=2_500_000,
         select_every=131_072,
         select_episodes=200,
+        student_decay_steps=1_300_000,
     ),
     "pixels": train_config(n_step=5),
     "state": train_config(
@@ -100,6 +101,7 @@ PRESETS: dict[str, TrainConfig] = {
         select_every=2_097_152,
         select_episodes=200,
         student_starts=8_000_000,
+        student_decay_steps=32_000_000,
         teacher_batch_size=8_192,
         student_batch_size=2_048,
         student_updates_per_step=4,
