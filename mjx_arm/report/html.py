@@ -52,6 +52,16 @@ td { overflow-wrap: anywhere; }
 code, pre { font: .88rem/1.5 ui-monospace, "DejaVu Sans Mono", monospace; }
 pre { background: var(--card); border: 1px solid var(--line); border-radius: .5rem;
   padding: .7rem .9rem; overflow-x: auto; margin: .4rem 0; }
+figure { margin: .8rem 0 1rem; }
+figure img { background: #fff; border-radius: .4rem; display: block; }
+.plot img { max-width: 100%; height: auto; }
+.strip div { overflow-x: auto; }
+.strip img { max-width: none; }
+figcaption { color: var(--quiet); font-size: .92rem; max-width: 52rem; margin-top: .3rem; }
+.source { font-size: .85rem; overflow-wrap: anywhere; }
+.missing { border-left: .25rem solid var(--accent); padding: .1rem 0 .1rem .9rem; margin: .8rem 0; }
+details { margin: .4rem 0; }
+details pre { max-height: 24rem; overflow: auto; }
 footer { margin-top: 2.5rem; color: var(--quiet); font-size: .88rem; }
 """
 
