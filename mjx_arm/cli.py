@@ -570,9 +570,7 @@ def _help(arguments: Sequence[str]) -> NoReturn:
     """Prints the help, which shows the values of the preset, and the options of the task."""
     train_ = Annotated[Train, tyro.conf.subcommand("train", default=_help_of(Train, arguments))]
     sweep_ = Annotated[Sweep, tyro.conf.subcommand("sweep", default=_help_of(Sweep, arguments))]
-    commands: Any = (
-        train_ | Eval | Play | Figures | Compare | Agents | View | sweep_ | Reproduce
-    )
+    commands: Any = train_ | Eval | Play | Figures | Compare | Agents | View | sweep_ | Reproduce
     first = [name for name in arguments[:1] if name in _COMMANDS]
     tyro.cli(
         commands,

@@ -334,9 +334,7 @@ def regrasping(plan: Plan) -> Iterator[Block]:
             continue
         opens = found.result["opens"]
         yield Heading(f"{subject.name}, in environment {subject.trained_in}", 3)
-        rows = [
-            (words, *_of(opens[kind], opens["random_opens"])) for kind, words in _OPENS.items()
-        ]
+        rows = [(words, *_of(opens[kind], opens["random_opens"])) for kind, words in _OPENS.items()]
         yield Table(
             ("a random open", "times", "share", "grasped again", "the episode succeeded"),
             tuple(rows),

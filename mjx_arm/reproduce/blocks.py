@@ -155,7 +155,7 @@ def _markdown(block: Block, pictures: str) -> Iterator[str]:
         case Command(lines):
             yield from ("```text", *lines, "```")
         case Fold(title, text):
-            yield from (f"<details><summary>{title}</summary>", "", "```json", text, "```", "")
+            yield from (f"<details><summary>{title}</summary>", "", "```text", text, "```", "")
             yield "</details>"
 
 

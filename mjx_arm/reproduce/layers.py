@@ -29,9 +29,7 @@ class Layer:
     operations: int
 
 
-def layers_of(
-    network: PixelQNetwork, *, size: tuple[int, int], cameras: int = 1
-) -> list[Layer]:
+def layers_of(network: PixelQNetwork, *, size: tuple[int, int], cameras: int = 1) -> list[Layer]:
     """The layers of the shipped network, in order.
 
     Args:

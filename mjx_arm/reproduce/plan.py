@@ -397,4 +397,3 @@ def _digest(path: pathlib.Path) -> str:
     if not path.is_file():
         raise ValueError(f"{path} is not there")
     return hashlib.sha256(path.read_bytes()).hexdigest()
-

@@ -175,9 +175,7 @@ def _repeated(plan: Plan) -> list[Ablation | None]:
     return [None, *(each for each in ABLATIONS if each.name in strongest)] if strongest else []
 
 
-def _ablation_table(
-    plan: Plan, env: str, names: list[Ablation | None]
-) -> Iterator[Block]:
+def _ablation_table(plan: Plan, env: str, names: list[Ablation | None]) -> Iterator[Block]:
     default = plan.read(f"ablation-{env}-{DEFAULT}")
     rows, effects, files, said = [], [], [], []
     for ablation in names:
