@@ -11,7 +11,7 @@ from mjx_arm.report.run_page import interval, percent
 from mjx_arm.reproduce import james_johns
 from mjx_arm.reproduce.blocks import Block, Heading, Missing, Picture, Source, Table, Text
 from mjx_arm.reproduce.curves import REGULAR_EPISODES
-from mjx_arm.reproduce.plan import Plan
+from mjx_arm.reproduce.plan import Plan, trial_of
 from mjx_arm.reproduce.plots import (
     draw_figure3,
     draw_figure4,
@@ -87,8 +87,8 @@ def _scene(plan: Plan, scene: str, found: Measured) -> Iterator[Block]:
             ),
         )  # fmt: skip
         yield Text(
-            "The two renderers differ where MuJoCo's smooths edges and casts soft shadows; at "
-            "network size the agent's images have no shadows."
+            "The difference is mostly at edges, which MuJoCo smooths. At network size both render "
+            "without shadows, as the agents see it."
         )
     yield Source((found.file,))
 
@@ -208,8 +208,8 @@ def table1(plan: Plan) -> Iterator[Block]:
     yield Table(head, tuple(rows))
     yield Text(
         "Share of episodes that end in success, one action in ten random (ε = 0.1). An episode "
-        "has at most 1,000 steps. The interval is over episodes (Wilson) where there is one seed, "
-        "and over seeds (Student) where there are several. 'Held, not lifted' is the share of the "
+        f"has at most {trial_of('A', plan.quick).max_steps:,} steps. The interval "
+        "is over episodes (Wilson) where there is one seed, and over seeds (Student) where there are several. 'Held, not lifted' is the share of the "
         "episodes that grasped the cube at some time and failed. Each way of training has rows of "
         "its own; the rows are different experiments."
     )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import datetime
 import json
 import pathlib
@@ -62,8 +61,6 @@ def reproduce(
     for cell in plan.cells:
         if plan.is_chosen(cell.name, cell.section) and plan.read(cell.name) is None:
             _measure(plan, cell, console)
-            # A page at any time: a long command may be stopped.
-            write_pages(plan)
     page = write_pages(plan)
     console.print(f"page: {page}", soft_wrap=True)
     return page
@@ -98,4 +95,4 @@ def _measure(plan: Plan, cell: Cell, console: Console) -> None:
         seconds=round(time.perf_counter() - started, 1),
         date=datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
     )
-    plan.store.write(dataclasses.replace(measured), pictures)
+    plan.store.write(measured, pictures)

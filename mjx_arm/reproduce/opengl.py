@@ -10,6 +10,7 @@ import pathlib
 import subprocess
 import sys
 import tempfile
+from collections.abc import Mapping
 
 import mujoco
 import numpy as np
@@ -19,7 +20,7 @@ _TIMEOUT_S = 300.0
 
 
 def render_by_mujoco(
-    model: mujoco.MjModel, qpos: np.ndarray, camera: str, edges: tuple[int, ...]
+    model: mujoco.MjModel, qpos: np.ndarray, camera: str, sizes: Mapping[int, bool]
 ) -> list[np.ndarray]:
     """Renders states by MuJoCo's renderer.
 
@@ -27,7 +28,7 @@ def render_by_mujoco(
       model: of the scene.
       qpos: `[K, nq] float32`.
       camera: a camera's name.
-      edges: of the square images, pixels.
+      sizes: edges of the square images, pixels, and whether they have shadows.
 
     Returns:
       For each edge `[K, edge, edge, 3] uint8`.
@@ -37,7 +38,7 @@ def render_by_mujoco(
     """
     given = os.environ.get("MUJOCO_GL")
     for backend in (given,) if given else _BACKENDS:
-        found = _in_a_process(backend, model, qpos, camera, edges)
+        found = _in_a_process(backend, model, qpos, camera, sizes)
         if found is not None:
             return found
     raise ValueError(
@@ -46,12 +47,18 @@ def render_by_mujoco(
 
 
 def _in_a_process(
-    backend: str, model: mujoco.MjModel, qpos: np.ndarray, camera: str, edges: tuple[int, ...]
+    backend: str, model: mujoco.MjModel, qpos: np.ndarray, camera: str, sizes: Mapping[int, bool]
 ) -> list[np.ndarray] | None:
     with tempfile.TemporaryDirectory() as name:
         folder = pathlib.Path(name)
         mujoco.mj_saveModel(model, str(folder / "scene.mjb"), None)
-        np.savez(folder / "states.npz", qpos=qpos, camera=np.asarray(camera), edges=edges)
+        np.savez(
+            folder / "states.npz",
+            qpos=qpos,
+            camera=np.asarray(camera),
+            edges=list(sizes),
+            shadows=list(sizes.values()),
+        )
         command = [sys.executable, "-m", "mjx_arm.reproduce.opengl", str(folder)]
         environment = os.environ | {"MUJOCO_GL": backend}
         try:
@@ -59,7 +66,7 @@ def _in_a_process(
                 command, env=environment, check=True, capture_output=True, timeout=_TIMEOUT_S
             )
             with np.load(folder / "images.npz") as images:
-                return [images[str(edge)] for edge in edges]
+                return [images[str(edge)] for edge in sizes]
         except (subprocess.SubprocessError, OSError):
             return None
 
@@ -69,9 +76,10 @@ def _render(folder: pathlib.Path) -> None:
     model = mujoco.MjModel.from_binary_path(str(folder / "scene.mjb"))
     data = mujoco.MjData(model)
     with np.load(folder / "states.npz") as states:
-        poses, camera, edges = states["qpos"], str(states["camera"]), states["edges"].tolist()
+        poses, camera = states["qpos"], str(states["camera"])
+        edges, shadows = states["edges"].tolist(), states["shadows"].tolist()
     images = {}
-    for edge in edges:
+    for edge, shadow in zip(edges, shadows, strict=True):
         model.vis.global_.offwidth = max(model.vis.global_.offwidth, edge)
         model.vis.global_.offheight = max(model.vis.global_.offheight, edge)
         with mujoco.Renderer(model, edge, edge) as renderer:
@@ -80,6 +88,7 @@ def _render(folder: pathlib.Path) -> None:
                 data.qpos[:] = qpos
                 mujoco.mj_forward(model, data)
                 renderer.update_scene(data, camera)
+                renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = shadow
                 own.append(renderer.render().copy())
         images[str(edge)] = np.stack(own)
     np.savez(folder / "images.npz", **images)

@@ -38,7 +38,7 @@ from mjx_arm.reproduce.trials import (
     measure_network,
     trial_inputs,
 )
-from mjx_arm.scene import load_scene, scene_exists
+from mjx_arm.scene import read_source, scene_exists
 from mjx_arm.training.agent import BEST, LAST
 
 # Parts of the page. The first ones are made by default, the others are long and must be asked for.
@@ -233,7 +233,8 @@ def _with_own(
     return [*subjects, *own]
 
 
-def _trial(env: str, quick: bool, **changes: Any) -> Trial:
+def trial_of(env: str, quick: bool, **changes: Any) -> Trial:
+    """How agents are tried in an environment: 1,000 episodes, or few short ones if `quick`."""
     trial = Trial(env, 40 if quick else 1_000, max_steps=300 if quick else 1_000)
     return dataclasses.replace(trial, **changes)
 
@@ -266,7 +267,7 @@ def _scene_cell(scene: str) -> Cell:
         f"figure1-{scene}",
         "figure1",
         lambda: measure_scene(scene),
-        lambda: {"scene_sha256": load_scene(scene).source.digest},
+        lambda: {"scene_sha256": read_source(scene).digest},
     )
 
 
@@ -292,7 +293,7 @@ def _curve_cell(subject: Subject) -> Cell:
 
 
 def _episodes_cell(subject: Subject, env: str, quick: bool) -> Cell:
-    agent, trial = str(subject.agent), _trial(env, quick)
+    agent, trial = str(subject.agent), trial_of(env, quick)
     name = f"episodes-{subject.name}-in-{env}"
     return Cell(
         name,
@@ -305,7 +306,7 @@ def _episodes_cell(subject: Subject, env: str, quick: bool) -> Cell:
 def _greedy_cell(subject: Subject, quick: bool) -> Cell:
     episodes = 20 if quick else 100
     agent, name = str(subject.agent), f"figure4-{subject.name}"
-    trial = _trial(subject.trained_in, quick, episodes=episodes, epsilon=0.0)
+    trial = trial_of(subject.trained_in, quick, episodes=episodes, epsilon=0.0)
     return Cell(
         name,
         "figure4",
@@ -352,7 +353,7 @@ def _study_cells(store: Store, trainings: Sequence[Training], quick: bool) -> It
 
 
 def _reward_cell(training: Training, run: pathlib.Path, quick: bool) -> Cell:
-    trial = _trial("A", quick, episodes=40 if quick else 400)
+    trial = trial_of("A", quick, episodes=40 if quick else 400)
     name = training.name
     return Cell(
         name,
@@ -364,7 +365,7 @@ def _reward_cell(training: Training, run: pathlib.Path, quick: bool) -> Cell:
 
 
 def _paper_cell(training: Training, run: pathlib.Path, quick: bool) -> Cell:
-    trials = {"epsilon 0.1": _trial("A", quick), "greedy": _trial("A", quick, epsilon=0.0)}
+    trials = {"epsilon 0.1": trial_of("A", quick), "greedy": trial_of("A", quick, epsilon=0.0)}
     name = training.name
     return Cell(
         name,

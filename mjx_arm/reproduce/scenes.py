@@ -37,7 +37,8 @@ def measure_scene(scene: str) -> tuple[dict[str, Any], dict[str, bytes]]:
     names = {EDGE: "camera", NETWORK_EDGE: "network"}
     rows, labels, result = [], [], {"moments": list(states), "edges": [EDGE, NETWORK_EDGE]}
     try:
-        found = render_by_mujoco(env.scene.mj_model, qpos, "front", (EDGE, NETWORK_EDGE))
+        sizes = {EDGE: True, NETWORK_EDGE: env.config.shadows}
+        found = render_by_mujoco(env.scene.mj_model, qpos, env.config.cameras[0], sizes)
         theirs = dict(zip(ours, found, strict=True))
     except ValueError as error:
         theirs, result["mujoco_missing"] = {}, str(error)

@@ -45,7 +45,7 @@ def test_a_cell_without_its_picture_counts_as_missing(store):
 def test_a_damaged_file_is_named(store, content):
     path = store.folder / "cells" / "cell.json"
     path.write_text(content)
-    with pytest.raises(ValueError, match="cell.json is damaged: remove it"):
+    with pytest.raises(ValueError, match=r"cell\.json is damaged: remove it"):
         store.read("cell")
 
 

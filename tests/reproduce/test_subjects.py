@@ -63,7 +63,7 @@ def test_two_runs_of_one_seed_are_refused(tmp_path):
 def test_seeds_with_different_options_are_refused(tmp_path):
     make_run(tmp_path / "one", env="B")
     make_run(tmp_path / "two", env="B", seed=1, learning_rate=1e-3)
-    with pytest.raises(ValueError, match="such as learning_rate = 0.0003 and 0.001"):
+    with pytest.raises(ValueError, match=r"such as learning_rate = 0\.0003 and 0\.001"):
         merge(find_runs(tmp_path), [])
 
 
