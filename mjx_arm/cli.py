@@ -404,6 +404,7 @@ class Reproduce:
       out: folder of the page.
       runs: a folder of run folders, or a run folder, whose agents are shown.
       shipped: show the agents that come with the package where the runs have none.
+      seeds: of each agent that is trained.
       quick: tiny trainings and few episodes, to prove in minutes that everything works.
       only: parts to measure: `agents`, `figure1`, `figure2`, `figure3`, `episodes`, `figure4`,
         `pixels`, `reward`, `paper`, `ablations`, `ablations-B`, `page` (the page alone), or the
@@ -413,6 +414,7 @@ class Reproduce:
     out: pathlib.Path = pathlib.Path("runs/reproduction")
     runs: pathlib.Path | None = None
     shipped: bool = False
+    seeds: int = 1
     quick: bool = False
     only: tuple[str, ...] = ()
 
@@ -426,6 +428,7 @@ class Reproduce:
             shipped=self.shipped,
             quick=self.quick,
             only=self.only,
+            seeds=self.seeds,
             console=make_console(),
         )
 

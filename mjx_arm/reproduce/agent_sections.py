@@ -208,9 +208,10 @@ def table1(plan: Plan) -> Iterator[Block]:
     yield Table(head, tuple(rows))
     yield Text(
         "Share of episodes that end in success, one action in ten random (ε = 0.1). An episode "
-        f"has at most {trial_of('A', plan.quick).max_steps:,} steps. The interval "
-        "is over episodes (Wilson) where there is one seed, and over seeds (Student) where there are several. 'Held, not lifted' is the share of the "
-        "episodes that grasped the cube at some time and failed. Each way of training has rows of "
+        f"has at most {trial_of('A', plan.quick).max_steps:,} steps. The interval is over "
+        "episodes (Wilson) where there is one seed, and over seeds (Student) where there are "
+        "several. 'Held, not lifted' is the share of the episodes that grasped the cube at some "
+        "time and failed. Each way of training has rows of "
         "its own; the rows are different experiments."
     )
     yield Source(tuple(files))

@@ -7,6 +7,7 @@ import json
 import pathlib
 import time
 from collections.abc import Sequence
+from typing import Any
 
 from rich.console import Console
 
@@ -24,6 +25,7 @@ def reproduce(
     shipped: bool = False,
     quick: bool = False,
     only: Sequence[str] = (),
+    seeds: int = 1,
     console: Console | None = None,
 ) -> pathlib.Path:
     """Makes the page of the paper's tables and figures.
@@ -37,6 +39,7 @@ def reproduce(
       shipped: show the agents that come with the package where `runs` has none.
       quick: tiny trainings and few episodes, to prove the path.
       only: sections or cells to measure; by default everything but the long studies.
+      seeds: of each agent that is trained.
       console: where it prints; by default nowhere.
 
     Returns:
@@ -48,16 +51,21 @@ def reproduce(
       RunInterruptedError: Ctrl-C or a signal while it trains.
     """
     console = Console(quiet=True) if console is None else console
-    if not quick and not only and runs is None and not shipped:
-        console.print("no --runs and no --shipped: agents A and B are trained first")
-    plan = make_plan(out, runs=runs, shipped=shipped, quick=quick, only=only)
+    options: dict[str, Any] = {
+        "runs": runs,
+        "shipped": shipped,
+        "quick": quick,
+        "only": only,
+        "seeds": seeds,
+    }
+    plan = make_plan(out, **options)
     plan.store.prepare()
     trainings = plan.wanted_trainings()
     _say_hours(trainings, console)
     for training in trainings:
         run_training(training, plan.run_folder(training), console)
     # Again: there are agents now that were not there.
-    plan = make_plan(out, runs=runs, shipped=shipped, quick=quick, only=only)
+    plan = make_plan(out, **options)
     for cell in plan.cells:
         if plan.is_chosen(cell.name, cell.section) and plan.read(cell.name) is None:
             _measure(plan, cell, console)

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 from mjx_arm.config import dump_config
-from mjx_arm.options import check_name
+from mjx_arm.options import Count, check_name, check_value
 from mjx_arm.reproduce.curves import read_curve
 from mjx_arm.reproduce.scenes import SCENES, measure_scene
 from mjx_arm.reproduce.store import RUNS, Measured, Store
@@ -19,6 +19,7 @@ from mjx_arm.reproduce.studies import measure_ablation, measure_paper, measure_r
 from mjx_arm.reproduce.subjects import Subject, find_runs, find_shipped, merge, way_of
 from mjx_arm.reproduce.trainings import (
     ABLATIONS,
+    AGENTS,
     DEFAULT,
     STRONGEST,
     Training,
@@ -26,7 +27,6 @@ from mjx_arm.reproduce.trainings import (
     agent_trainings,
     is_finished,
     paper_training,
-    pixel_trainings,
     reward_trainings,
     shorten,
 )
@@ -153,9 +153,8 @@ class Plan:
         ]
 
     def _agent_trainings(self) -> Iterator[tuple[str, list[Training]]]:
-        names = {"agents": "agent-", "pixels": "pixels-"}
-        for section, start in names.items():
-            yield section, [each for each in self.trainings if each.name.startswith(start)]
+        for section, (start, _) in AGENTS.items():
+            yield section, [x for x in self.trainings if x.name.startswith(f"{start}-")]
 
 
 def make_plan(
@@ -165,6 +164,7 @@ def make_plan(
     shipped: bool,
     quick: bool,
     only: Sequence[str],
+    seeds: int = 1,
 ) -> Plan:
     """Plans the page.
 
@@ -174,14 +174,16 @@ def make_plan(
       shipped: show the agents that come with the package where the runs have none.
       quick: tiny trainings and few episodes, to prove the path.
       only: sections or cells to measure; empty for those that are made by default.
+      seeds: of each agent that is trained.
 
     Raises:
       ValueError: a name in `only` is unknown, or there is no run folder.
     """
+    check_value("seeds", Count, seeds)
     store = Store(out)
-    options = _options(out, runs=runs, shipped=shipped, quick=quick)
+    options = _options(out, runs=runs, shipped=shipped, quick=quick, seeds=seeds)
     adapt = shorten if quick else _same
-    made_here = [adapt(each) for each in (*agent_trainings(), *pixel_trainings())]
+    made_here = [adapt(each) for section in AGENTS for each in agent_trainings(section, seeds)]
     trains = runs is None and not shipped
     subjects = merge(
         [] if runs is None else find_runs(runs),
@@ -208,11 +210,12 @@ def _same(training: Training) -> Training:
 
 
 def _options(
-    out: pathlib.Path, *, runs: pathlib.Path | None, shipped: bool, quick: bool
+    out: pathlib.Path, *, runs: pathlib.Path | None, shipped: bool, quick: bool, seeds: int
 ) -> tuple[str, ...]:
     words = [] if runs is None else ["--runs", str(runs)]
     words += ["--shipped"] if shipped else []
     words += ["--quick"] if quick else []
+    words += ["--seeds", str(seeds)] if seeds > 1 else []
     return (*words, "--out", str(out))
 
 

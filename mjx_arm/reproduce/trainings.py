@@ -133,14 +133,23 @@ def shorten(training: Training) -> Training:
     return Training(training.name, config, None, _QUICK_EPISODES)
 
 
-def agent_trainings() -> list[Training]:
-    """Agents A and B, by the default preset."""
-    return [_training(f"agent-{env}", PRESETS["fast"], env=env) for env in ("A", "B")]
+# Name of a section of the page -> start of the names of its runs, and their preset.
+AGENTS = {"agents": ("agent", "fast"), "pixels": ("pixels", "pixels")}
 
 
-def pixel_trainings() -> list[Training]:
-    """Agents A and B without a teacher."""
-    return [_training(f"pixels-{env}", PRESETS["pixels"], env=env) for env in ("A", "B")]
+def agent_trainings(section: str, seeds: int = 1) -> list[Training]:
+    """Agents A and B by the default preset (`agents`), or without a teacher (`pixels`).
+
+    Args:
+      section: a key of `AGENTS`.
+      seeds: of each, from 0 on.
+    """
+    start, preset = AGENTS[section]
+    return [
+        _training(f"{start}-{env}-seed{seed}", PRESETS[preset], env=env, seed=seed)
+        for env in ("A", "B")
+        for seed in range(seeds)
+    ]
 
 
 # Name -> options that differ from the preset, and what the row says.

@@ -29,7 +29,8 @@ def plan_of(tmp_path, **options):
 
 def test_without_agents_a_and_b_are_trained(tmp_path):
     names = [training.name for training in plan_of(tmp_path).wanted_trainings()]
-    assert names == ["agent-A", "agent-B"]
+    assert names == ["agent-A-seed0", "agent-B-seed0"]
+    assert len(plan_of(tmp_path, seeds=3).wanted_trainings()) == 6
 
 
 @pytest.mark.parametrize("options", [{"shipped": True}, {"only": ("figure1",)}])
@@ -80,7 +81,7 @@ def test_rewards_differ_in_nothing_but_the_reward_and_the_discount():
 
 
 def test_every_training_has_hours_and_a_quick_form():
-    for training in (*agent_trainings(), *reward_trainings(), paper_training()):
+    for training in (*agent_trainings("agents"), *reward_trainings(), paper_training()):
         assert 0.1 < training.hours < 5
         quick = shorten(training)
         assert quick.config.total_steps < 20_000
@@ -110,6 +111,7 @@ def test_the_strongest_changes_are_known_when_all_are_measured(tmp_path):
         (["--runs", "nowhere"], "--runs nowhere is not a folder"),
         (["--runs", "."], "--runs . holds no run folder"),
         (["--out", "file", "--shipped", "--only", "page"], "cannot be made"),
+        (["--seeds", "0"], "seeds must be a whole number of at least 1"),
         (["page"], "unexpected argument 'page'"),
         (["--quik"], "unknown option '--quik': did you mean '--quick'?"),
     ],
