@@ -192,7 +192,7 @@ def make_plan(
     subjects = _with_own(subjects, store, made_here, trains)
     trainings = [*made_here, *map(adapt, _study_trainings(store, quick))]
     cells = [*_agent_cells(subjects, quick), *_study_cells(store, trainings, quick)]
-    names = {*SECTIONS, *(cell.name for cell in cells)}
+    names = [*SECTIONS, *(cell.name for cell in cells)]
     for name in only:
         check_name("section or cell", name, names)
     chosen = set(only)

@@ -19,6 +19,7 @@ _FONT_SIZE = 15
 _LABEL = 22
 _GAP = 4
 _COLOURS = 128
+_COLOURS_OF_FRAMES = 64
 _AT_ONCE = 16
 
 # `(qpos [K, nq], params)` -> `[K, H, W, 3] uint8`.
@@ -105,7 +106,9 @@ def animation(frames: np.ndarray, labels: Sequence[str], *, milliseconds: int) -
         draw = ImageDraw.Draw(image)
         draw.text((6, 4), text, fill="white", stroke_width=2, stroke_fill="black", font=font)
         images.append(
-            image.quantize(_COLOURS, method=Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
+            image.quantize(
+                _COLOURS_OF_FRAMES, method=Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE
+            )
         )
     content = io.BytesIO()
     images[0].save(

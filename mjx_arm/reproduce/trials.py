@@ -32,7 +32,7 @@ EPSILON = 0.1
 # Of starts and random actions; neither training nor selection has seen it.
 _SEED = 21
 _TILE, _TILES = 176, 6
-_MOST_FRAMES, _BEFORE = 80, 16
+_MOST_FRAMES, _BEFORE = 60, 16
 _MILLISECONDS = 80
 
 Result = tuple[dict[str, Any], dict[str, bytes]]
@@ -162,7 +162,7 @@ def _animation(name: str, agent: Agent, rollouts: Sequence[Rollout]) -> dict[str
         frames = np.append(frames, len(rollout))
     grasped = np.concatenate([[False], rollout.grasped])
     labels = [_moment(int(frame), step, grasped, len(rollout)) for frame in frames]
-    images = make_frames(agent.env, edge=256)(rollout.qpos[frames], rollout.params)
+    images = make_frames(agent.env, edge=192)(rollout.qpos[frames], rollout.params)
     return {f"{name}-again.gif": animation(images, labels, milliseconds=_MILLISECONDS)}
 
 
