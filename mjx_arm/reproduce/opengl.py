@@ -11,6 +11,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Mapping
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -78,7 +79,7 @@ def _render(folder: pathlib.Path) -> None:
     with np.load(folder / "states.npz") as states:
         poses, camera = states["qpos"], str(states["camera"])
         edges, shadows = states["edges"].tolist(), states["shadows"].tolist()
-    images = {}
+    images: dict[str, Any] = {}
     for edge, shadow in zip(edges, shadows, strict=True):
         model.vis.global_.offwidth = max(model.vis.global_.offwidth, edge)
         model.vis.global_.offheight = max(model.vis.global_.offheight, edge)

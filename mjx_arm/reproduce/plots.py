@@ -135,18 +135,17 @@ def draw_network(layers: Sequence[Mapping[str, Any]]) -> bytes:
     figure = Figure(figsize=(10.0, 3.6))
     axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
     axes.set_axis_off()
-    x, tops = 0.0, []
-    for layer in layers:
+    x = 0.0
+    for number, layer in enumerate(layers):
         shape = layer["output"]
         height = np.sqrt(shape[0]) if len(shape) == 3 else np.log2(shape[0])
         width = 0.35 + (np.log2(shape[-1]) / 5 if len(shape) == 3 else 0.0)
-        shade = str(0.93 - 0.07 * min(6, len(tops)))
+        shade = str(0.93 - 0.07 * min(6, number))
         axes.add_patch(Rectangle((x, -height / 2), width, height, fc=shade, ec="black", lw=1))
         size = "×".join(map(str, shape))
         axes.text(x + width / 2, -height / 2 - 0.3, size, ha="center", va="top", fontsize=8.5)
         name = str(layer["name"]).replace(", ", "\n").replace(" of ", "\nof ")
         axes.text(x + width / 2, 4.6, name, ha="center", va="bottom", fontsize=8)
-        tops.append(x)
         x += width + 1.35
         if layer is not layers[-1]:
             axes.annotate("", (x - 0.12, 0), (x - 1.23, 0), arrowprops={"arrowstyle": "->"})

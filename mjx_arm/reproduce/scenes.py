@@ -76,7 +76,8 @@ def _moments(scene: str) -> dict[str, np.ndarray]:
 def _scripted(env: Env) -> dict[str, np.ndarray]:
     """The first grasp and the end of an episode by the scripted policy."""
     policy, step = jax.jit(make_scripted_policy(env)), jax.jit(env.transition)
-    state, found = jax.jit(env.reset)(jax.random.key(_STARTS[-1]))[1], {}
+    state = jax.jit(env.reset)(jax.random.key(_STARTS[-1]))[1]
+    found: dict[str, np.ndarray] = {}
     for _ in range(_MOST_STEPS):
         state, transition = step(state, policy(state))
         if bool(transition.metrics["grasped"]):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import io
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import jax
 import numpy as np
@@ -49,7 +50,7 @@ def make_frames(env: Env, *, edge: int | None = None) -> RenderFrames:
 
 
 def _render_all(
-    render: Callable[[jax.Array, Params], jax.Array], qpos: np.ndarray, params: Params
+    render: Callable[[Any, Params], jax.Array], qpos: np.ndarray, params: Params
 ) -> np.ndarray:
     frames = []
     for start in range(0, len(qpos), _AT_ONCE):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import pathlib
+from typing import Any
 
 from rich.console import Console
 
@@ -74,7 +75,11 @@ def run_training(training: Training, folder: pathlib.Path, console: Console) -> 
     if is_finished(training, folder):
         return
     console.print(f"training {training.name}: about {describe_hours(training.hours)}")
-    options = {"eval_episodes": training.episodes, "video": False, "console": console}
+    options: dict[str, Any] = {
+        "eval_episodes": training.episodes,
+        "video": False,
+        "console": console,
+    }
     if not (folder / CONFIG).is_file():
         train(training.config, folder, minutes=training.minutes, **options)
         return
