@@ -46,7 +46,8 @@ _ROWS = (
     ("mean_reward", "mean reward of a step", "reward"),
     ("mean_max_q", "mean maximum Q of a step", "Q-value"),
 )
-_X = (("episode", "episodes"), ("env_steps", "environment steps"))
+# Column, label, and unit of a horizontal axis.
+_X = (("episode", "episodes", 1.0), ("env_steps", "environment steps, millions", 1e6))
 
 
 def draw_figure3(groups: Mapping[str, Sequence[Curve]]) -> bytes:
@@ -58,19 +59,23 @@ def draw_figure3(groups: Mapping[str, Sequence[Curve]]) -> bytes:
     """
     figure, axes = _axes(9.6, 8.4, len(_ROWS), len(_X))
     for row, (column, title, unit) in enumerate(_ROWS):
-        for place, (x, x_label) in enumerate(_X):
+        for place, (x, x_label, unit_of_x) in enumerate(_X):
             own = axes[row, place]
             for (name, seeds), (colour, dash) in zip(groups.items(), _style(), strict=False):
-                _draw_seeds(own, [_known(seed, x, column) for seed in seeds], name, colour, dash)
+                known = [_known(seed, x, column) for seed in seeds]
+                scaled = [(at / unit_of_x, values) for at, values in known]
+                _draw_seeds(own, scaled, name, colour, dash)
                 if row == 0:
-                    _mark_regular(own, seeds, x, colour, dash)
+                    _mark_regular(own, seeds, x, unit_of_x, colour, dash)
             if row == 0 and x == "episode":
                 own.axvline(REGULAR_EPISODE, color="black", lw=1, ls=":")
                 own.text(REGULAR_EPISODE, 0.98, " paper: 1,800", transform=_mixed(own), va="top",
                          fontsize=_SIZE - 1)  # fmt: skip
             _label(own, title, x_label, unit)
             own.xaxis.set_major_locator(MaxNLocator(5))
-    axes[0, 1].legend(fontsize=_SIZE - 1, loc="upper left")
+    handles, labels = axes[0, 0].get_legend_handles_labels()
+    if handles:
+        figure.legend(handles, labels, fontsize=_SIZE, loc="outside upper center")
     return to_svg(figure, "figure3")
 
 
@@ -101,10 +106,14 @@ def _draw_seeds(
     axes.plot(grid, values.mean(0), color=colour, ls=dash, lw=1.8, label=name)
 
 
-def _mark_regular(axes: Axes, seeds: Sequence[Curve], x: str, colour: str, dash: Any) -> None:
+def _mark_regular(
+    axes: Axes, seeds: Sequence[Curve], x: str, unit: float, colour: str, dash: Any
+) -> None:
     for seed in seeds:
         if seed["regular"] is not None:
-            axes.axvline(seed["regular"][x], color=colour, lw=1.2, ls=dash, alpha=0.8)
+            at = seed["regular"][x] / unit
+            axes.axvline(at, color=colour, lw=1.2, ls=dash, alpha=0.8)
+            axes.text(at, 0.86, " regular", transform=_mixed(axes), fontsize=_SIZE - 1)
 
 
 def draw_figure4(episode: Mapping[str, Any]) -> bytes:
@@ -132,25 +141,27 @@ def draw_figure4(episode: Mapping[str, Any]) -> bytes:
 
 def draw_network(layers: Sequence[Mapping[str, Any]]) -> bytes:
     """The network as a row of boxes, as high as the layer's picture and as wide as its channels."""
-    figure = Figure(figsize=(10.0, 3.6))
+    figure = Figure(figsize=(11.0, 3.4))
     axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
     axes.set_axis_off()
-    x = 0.0
+    pitch = 2.0
     for number, layer in enumerate(layers):
-        shape = layer["output"]
+        shape, middle = layer["output"], number * pitch
         height = np.sqrt(shape[0]) if len(shape) == 3 else np.log2(shape[0])
-        width = 0.35 + (np.log2(shape[-1]) / 5 if len(shape) == 3 else 0.0)
-        shade = str(0.93 - 0.07 * min(6, number))
-        axes.add_patch(Rectangle((x, -height / 2), width, height, fc=shade, ec="black", lw=1))
+        width = 0.3 + (np.log2(shape[-1]) / 8 if len(shape) == 3 else 0.0)
+        shade = str(0.95 - 0.07 * min(6, number))
+        corner = (middle - width / 2, -height / 2)
+        axes.add_patch(Rectangle(corner, width, height, fc=shade, ec="black", lw=1))
         size = "×".join(map(str, shape))
-        axes.text(x + width / 2, -height / 2 - 0.3, size, ha="center", va="top", fontsize=8.5)
+        axes.text(middle, -height / 2 - 0.3, size, ha="center", va="top", fontsize=9)
         name = str(layer["name"]).replace(", ", "\n").replace(" of ", "\nof ")
-        axes.text(x + width / 2, 4.6, name, ha="center", va="bottom", fontsize=8)
-        x += width + 1.35
-        if layer is not layers[-1]:
-            axes.annotate("", (x - 0.12, 0), (x - 1.23, 0), arrowprops={"arrowstyle": "->"})
-    axes.set_xlim(-0.9, x - 0.45)
-    axes.set_ylim(-5.4, 7.6)
+        name = name.replace(" and ", "\nand ").replace("fully ", "fully\n")
+        axes.text(middle, 4.5, name, ha="center", va="bottom", fontsize=8.5)
+        if number:
+            arrow = {"arrowstyle": "->"}
+            axes.annotate("", (middle - 0.6, 0), (middle - pitch + 0.6, 0), arrowprops=arrow)
+    axes.set_xlim(-pitch / 2, (len(layers) - 0.5) * pitch)
+    axes.set_ylim(-5.4, 7.9)
     return to_svg(figure, "network")
 
 
@@ -236,15 +247,15 @@ def draw_study(groups: Mapping[str, Sequence[Curve]], *, goal: float | None = No
     for (name, seeds), (colour, dash) in zip(groups.items(), _style(), strict=False):
         for own, column, factor in ((left, "success_rate", 100), (right, "mean_max_q", 1)):
             curves = [_known(seed, "env_steps", column) for seed in seeds]
-            scaled = [(x, factor * y) for x, y in curves]
+            scaled = [(x / 1e6, factor * y) for x, y in curves]
             _draw_seeds(own, scaled, name, colour, dash)
     left.set_ylim(-3, 103)
     if goal is not None:
         right.axhline(goal, color="black", lw=1, ls=":")
         right.text(0.01, goal, "reward of success", transform=right.get_yaxis_transform(),
                    fontsize=_SIZE - 1, va="bottom")  # fmt: skip
-    _label(left, "success of training episodes", "environment steps", "%")
-    _label(right, "mean maximum Q of a step", "environment steps", "Q-value")
+    _label(left, "success of training episodes", "environment steps, millions", "%")
+    _label(right, "mean maximum Q of a step", "environment steps, millions", "Q-value")
     if any(line.get_label()[:1] != "_" for line in left.get_lines()):
         left.legend(fontsize=_SIZE - 1)
     return to_svg(figure, "study")
