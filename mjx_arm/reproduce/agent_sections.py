@@ -28,10 +28,11 @@ from mjx_arm.training.evaluate import wilson_interval
 
 
 def missing_cells(plan: Plan, names: Iterable[str], what: str) -> Iterator[Block]:
-    """A sentence for each cell that has no file."""
-    for name in names:
-        if plan.read(name) is None:
-            yield Missing(f"{what}: the cell `{name}` is not measured yet.", plan.command(name))
+    """The cells that have no file, and the command that fills them."""
+    missing = [name for name in names if plan.read(name) is None]
+    if missing:
+        listed = ", ".join(f"`{name}`" for name in missing)
+        yield Missing(f"{what}. Not measured yet: {listed}.", plan.command(*missing))
 
 
 def _names(plan: Plan, section: str) -> list[str]:

@@ -81,8 +81,8 @@ def _head(plan: Plan) -> Iterator[Block]:
     )
     if plan.quick:
         yield Text(
-            "This is a quick run: its trainings are tiny and its episodes few. It proves that the "
-            "commands work; its figures say nothing about learning or about the paper."
+            "This is a quick run: its episodes are few and short, and what it trains is tiny. It "
+            "proves that the commands work; its figures are too uncertain to be quoted."
         )
     rows = []
     for subject in plan.subjects:

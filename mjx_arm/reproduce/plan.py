@@ -51,7 +51,7 @@ SECTIONS = {
     "figure4": "Q-values along one episode",
     "pixels": "agents A and B without a teacher",
     "reward": "the study of the reward",
-    "paper": "the preset `paper` in A",
+    "paper": "the preset paper in A",
     "ablations": "what matters, in A",
     "ablations-B": "the strongest of them in B",
     "page": "nothing is measured, the page alone is written again",

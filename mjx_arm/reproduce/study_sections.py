@@ -262,12 +262,16 @@ def transfer(plan: Plan) -> Iterator[Block]:
     if rows:
         yield Table(("level", "success", "95 % interval"), tuple(rows))
         yield Source(tuple(files))
-    for level in missing:
-        target = plan.store.folder / CELLS / f"transfer-{level}.json"
+    if missing:
+        folder = plan.store.folder / CELLS
         yield Missing(
-            f"Success in the stand-in for reality at level '{level}'. The command comes with the "
-            "desk scene, which is not part of this version.",
-            f"mjx-arm transfer AGENT --level {level} --episodes 200 --json > {target}",
+            f"Success in the stand-in for reality at {', '.join(missing)}. The command comes with "
+            "the desk scene.",
+            "\n".join(
+                f"mjx-arm transfer AGENT --level {level} --episodes 200 --json "
+                f"> {folder}/transfer-{level}.json"
+                for level in missing
+            ),
         )
     yield Text(
         "Figure 5, the feature maps of each layer in simulation and in the stand-in, comes with "

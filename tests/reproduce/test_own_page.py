@@ -13,8 +13,9 @@ from mjx_arm.cli import main
 
 ROOT = pathlib.Path(__file__).parents[2]
 PAGE = pathlib.Path("benchmarks/results/reproduce")
-# As the files in its folder say.
-ARGUMENTS = ("--runs", "benchmarks/results", "--shipped", "--out", str(PAGE))
+# As the files in its folder say: `mjx-arm reproduce --only CELL ...`.
+CELL = json.loads((ROOT / PAGE / "cells" / "figure1-arm_cube.json").read_text())
+ARGUMENTS = CELL["command"].split()[4:]
 
 
 @pytest.fixture(scope="module")
