@@ -45,6 +45,7 @@ th, td { text-align: left; padding: .3rem .9rem .3rem 0; border-bottom: 1px soli
 thead th { color: var(--quiet); font-weight: 600; font-size: .88rem; }
 tbody th { font-weight: 400; }
 .scroll:has(thead) tbody th { white-space: normal; min-width: 9rem; max-width: 18rem; }
+tbody th code { white-space: nowrap; }
 tr.changed th, tr.changed td { font-weight: 650; }
 .groups { columns: 20rem; column-gap: 2.5rem; }
 .groups section { break-inside: avoid; padding-top: .1rem; }

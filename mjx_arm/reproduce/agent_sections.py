@@ -32,7 +32,9 @@ def missing_cells(plan: Plan, names: Iterable[str], what: str) -> Iterator[Block
     missing = [name for name in names if plan.read(name) is None]
     if missing:
         listed = ", ".join(f"`{name}`" for name in missing)
-        yield Missing(f"{what}. Not measured yet: {listed}.", plan.command(*missing))
+        section = next(cell.section for cell in plan.cells if cell.name == missing[0])
+        short = [section] if missing == _names(plan, section) else missing
+        yield Missing(f"{what}. Not measured yet: {listed}.", plan.command(*short))
 
 
 def _names(plan: Plan, section: str) -> list[str]:
@@ -302,7 +304,7 @@ def _episode(plan: Plan, found: Measured) -> Iterator[Block]:
         f"The successful greedy episode of median length: {episode['length']} steps; the paper's "
         f"has {james_johns.EPISODE_LENGTH}. {greedy}. Q-values are divided by the scale of the "
         "reward. The frames are chosen automatically: the start; half of the way to the cube; the "
-        "gripper within 3 cm of it; the start of the last grasp; the end.",
+        "gripper within 4 cm of its centre; the start of the last grasp; the end.",
     )
     marks = ", ".join(f"{mark['name']} at step {mark['frame']}" for mark in episode["marks"])
     yield stored(

@@ -122,10 +122,12 @@ def draw_figure4(episode: Mapping[str, Any]) -> bytes:
     top, bottom = axes[:, 0]
     q = np.asarray(episode["q"]) / episode["reward_scale"]
     top.plot(q, color=COLOURS[0], lw=1.6)
+    numbers: dict[int, list[str]] = {}
     for i, mark in enumerate(episode["marks"]):
-        frame = min(mark["frame"], len(q) - 1)
+        numbers.setdefault(min(mark["frame"], len(q) - 1), []).append(str(i + 1))
+    for frame, marked in numbers.items():
         top.plot(frame, q[frame], "o", color="black", ms=5)
-        top.annotate(str(i + 1), (frame, q[frame]), (0, 7), textcoords="offset points",
+        top.annotate(", ".join(marked), (frame, q[frame]), (0, 7), textcoords="offset points",
                      ha="center", fontsize=_SIZE + 1, weight="bold")  # fmt: skip
     top.margins(y=0.2)
     _label(top, "largest Q-value before each step", "", "Q-value")
@@ -171,7 +173,7 @@ def draw_places(columns: Mapping[str, Any], rectangle: Sequence[float] | None) -
     own = axes[0, 0]
     cubes = 100 * np.asarray(columns["cube"], float)
     success = np.asarray(columns["success"], bool)
-    own.plot(cubes[success, 1], cubes[success, 0], "o", ms=3, mfc="none", mec=COLOURS[0],
+    own.plot(cubes[success, 1], cubes[success, 0], "o", ms=4, mfc="none", mec=COLOURS[0],
              mew=0.7, alpha=0.55, label=f"success ({success.sum()})")  # fmt: skip
     own.plot(cubes[~success, 1], cubes[~success, 0], "X", ms=8, color=COLOURS[1], mec="black",
              mew=0.6, label=f"failure ({(~success).sum()})")  # fmt: skip
@@ -203,6 +205,7 @@ def draw_joints(columns: Mapping[str, Any], noise: float) -> bytes:
     figure, axes = _axes(8.4, 4.8, 2, -(-count // 2))
     edges = np.linspace(-noise, noise, _BINS + 1)
     middles = (edges[1:] + edges[:-1]) / 2
+    least = 100.0
     for i, own in enumerate(axes.ravel()):
         if i >= count:
             own.set_axis_off()
@@ -212,10 +215,13 @@ def draw_joints(columns: Mapping[str, Any], noise: float) -> bytes:
             here = success[bins == b]
             if here.size:
                 low, high = wilson_interval(int(here.sum()), here.size)
+                least = min(least, 100 * low)
                 own.plot([middle, middle], [100 * low, 100 * high], color="0.35", lw=1.5)
                 own.plot(middle, 100 * here.mean(), "s", color=COLOURS[0], ms=5)
         own.axhline(100 * success.mean(), color="black", lw=0.8, ls=":")
         _label(own, f"joint {i + 1}", "degrees from home", "success, %" if i % 3 == 0 else "")
+    for own in axes.ravel():
+        own.set_ylim(max(0.0, least - 3), 103)
     return to_svg(figure, "joints")
 
 

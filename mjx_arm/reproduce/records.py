@@ -11,14 +11,15 @@ import numpy as np
 from mjx_arm.envs.arm import Arm
 from mjx_arm.reproduce.rollouts import Rollout
 
-# The gripper has reached the cube when its grasp site is this close to the cube's centre, m.
-REACH = 0.03
+# The gripper has reached the cube when its grasp site is this close to the cube's centre, m. A
+# grasped cube is up to 3 cm away from it; half of the cube's edge is 2.5 cm.
+REACH = 0.04
 # A cube that falls by more than this was dropped, m.
 FALL = 0.01
 # The causes of a failure, in the order in which an episode comes to them.
 CAUSES = {
-    "never_reached": "the gripper never came within 3 cm of the cube's centre",
-    "not_grasped": "it came within 3 cm, and never grasped the cube",
+    "never_reached": "the gripper never came within 4 cm of the cube's centre",
+    "not_grasped": "it came within 4 cm, and never grasped the cube",
     "dropped_and_lost": "it grasped the cube, and did not hold it at the end",
     "timed_out": "it held the cube at the end, and had not lifted it by 30 cm",
     "diverged": "the simulation diverged",
@@ -182,7 +183,7 @@ def marks_of(rollout: Rollout) -> list[Mark]:
     """Five frames of a successful episode, chosen as in Figure 4 of the paper.
 
     The start; the approach, half of the way to the cube; at the cube, where the gripper is within
-    3 cm of its centre for the first time; the start of the last grasp; and the end, lifted.
+    4 cm of its centre for the first time; the start of the last grasp; and the end, lifted.
     """
     # The distance after step i belongs to frame i + 1.
     far = rollout.distance[0]

@@ -150,10 +150,11 @@ def paper(plan: Plan) -> Iterator[Block]:
 def ablations(plan: Plan) -> Iterator[Block]:
     """What the parts of the default preset are worth."""
     yield Heading("What matters")
+    length = "a tiny training" if plan.quick else f"{ABLATION_MINUTES:g} minutes of training"
     yield Text(
-        f"The default preset with one thing changed, in environment A, {ABLATION_MINUTES:g} "
-        "minutes of training each on the same machine, one seed. Another seed may differ by more "
-        "than the interval, which is over episodes."
+        f"The default preset with one thing changed, in environment A, {length} each on the same "
+        "machine, one seed. Another seed may differ by more than the interval, which is over "
+        "episodes."
     )
     for env in ("A", "B"):
         names = [None, *ABLATIONS] if env == "A" else _repeated(plan)

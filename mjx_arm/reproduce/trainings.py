@@ -103,7 +103,10 @@ def _check_same(training: Training, folder: pathlib.Path) -> None:
 
 def describe_hours(hours: float) -> str:
     """Hours in words."""
-    return f"{hours:.1f} hours" if hours >= 1 else f"{max(1, round(60 * hours))} minutes"
+    if hours >= 1:
+        return f"{hours:.1f} hours"
+    minutes = max(1, round(60 * hours))
+    return f"{minutes} minutes" if minutes > 1 else "1 minute"
 
 
 # What the tiny trainings of `--quick` change.

@@ -15,6 +15,7 @@ from mjx_arm.reproduce.james_johns import EPISODES as PAPER_EPISODES
 from mjx_arm.reproduce.layers import count_params, layers_of
 from mjx_arm.reproduce.records import (
     CAUSES,
+    REACH,
     cause_of,
     count_opens,
     height_histogram,
@@ -61,6 +62,7 @@ def trial_inputs(agent: str, trial: Trial) -> dict[str, Any]:
     return {
         "agent_sha256": hashlib.sha256(content).hexdigest(),
         "seed": _SEED,
+        "reach": REACH,
         **dataclasses.asdict(trial),
     }
 

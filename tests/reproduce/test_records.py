@@ -42,7 +42,7 @@ def episode(grasped, height=None, distance=None, *, opens=(), success=False, div
         (episode([0, 1], success=True), None),
         (episode([0, 1], diverged=True), "diverged"),
         (episode([0, 0]), "never_reached"),
-        (episode([0, 0], distance=[0.2, 0.029]), "not_grasped"),
+        (episode([0, 0], distance=[0.2, 0.039]), "not_grasped"),
         (episode([0, 1, 0]), "dropped_and_lost"),
         (episode([0, 1, 1]), "timed_out"),
     ],
