@@ -307,7 +307,7 @@ def _episodes_cell(subject: Subject, env: str, quick: bool) -> Cell:
 
 
 def _greedy_cell(subject: Subject, quick: bool) -> Cell:
-    episodes = 20 if quick else 100
+    episodes = 40 if quick else 200
     agent, name = str(subject.agent), f"figure4-{subject.name}"
     trial = trial_of(subject.trained_in, quick, episodes=episodes, epsilon=0.0)
     return Cell(

@@ -96,15 +96,17 @@ def roll_out(
     auto, num_envs = AutoReset(env), min(episodes, MOST_ENVS)
     quota = np.full(num_envs, episodes // num_envs)
     quota[: episodes % num_envs] += 1
-    step = functools.partial(_step, auto, apply, jnp.float32(epsilon))
-    advance = jax.jit(
-        lambda params, run: jax.lax.scan(functools.partial(step, params), run, None, _CHUNK),
-        compiler_options=compiler_options(env.physics),
-    )
+
+    def record_chunk(params: Any, epsilon: jax.Array, run: _Run) -> tuple[_Run, dict[str, Any]]:
+        step = functools.partial(_step, auto, apply, params, epsilon)
+        return jax.lax.scan(step, run, None, _CHUNK)
+
+    # Of all agents and epsilons in one environment one program: a compilation cache finds it again.
+    advance = jax.jit(record_chunk, compiler_options=compiler_options(env.physics))
     run = jax.jit(functools.partial(_start, auto))(key, jnp.asarray(quota, jnp.int32))
     chunks = []
     while int(jnp.max(run.left)) > 0:
-        run, chunk = advance(params, run)
+        run, chunk = advance(params, jnp.float32(epsilon), run)
         chunks.append(jax.device_get(chunk))
     steps = jax.tree.map(lambda *parts: np.concatenate(parts), *chunks)
     return _split(steps, quota)
@@ -117,7 +119,7 @@ def _start(auto: AutoReset, key: jax.Array, quota: jax.Array) -> _Run:
 
 
 def _step(
-    auto: AutoReset, apply: Apply, epsilon: jax.Array, params: Any, run: _Run, _: None
+    auto: AutoReset, apply: Apply, params: Any, epsilon: jax.Array, run: _Run, _: None
 ) -> tuple[_Run, dict[str, Any]]:
     key, act_key = jax.random.split(run.key)
     q = apply(params, run.obs)
