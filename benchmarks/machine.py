@@ -2,30 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import pathlib
-import platform
-from typing import Any
+from mjx_arm.report.machine import machine
 
-import jax
-import mujoco
-
-from mjx_arm.cores import usable_cores
-
-
-def machine() -> dict[str, Any]:
-    """Processor, device and versions."""
-    name = platform.processor()
-    cpuinfo = pathlib.Path("/proc/cpuinfo")
-    if cpuinfo.is_file():
-        lines = cpuinfo.read_text().splitlines()
-        name = next((x.split(":")[1].strip() for x in lines if x.startswith("model name")), name)
-    return {
-        "cpu": name,
-        "cores": usable_cores(),
-        "device": jax.devices()[0].device_kind,
-        "python": platform.python_version(),
-        "jax": jax.__version__,
-        "mujoco": mujoco.__version__,
-        "xla_flags": os.environ.get("XLA_FLAGS", ""),
-    }
+__all__ = ["machine"]

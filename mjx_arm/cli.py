@@ -30,6 +30,7 @@ from mjx_arm.report.figures import plot_curves
 from mjx_arm.report.progress import make_console
 from mjx_arm.report.run_page import write_report
 from mjx_arm.report.video import check_video_path, draw_episode, record_episode, write_video
+from mjx_arm.reproduce.command import reproduce
 from mjx_arm.tools.compare import describe, read_result, to_json, write_comparison
 from mjx_arm.tools.search_space import parse_space
 from mjx_arm.tools.sweep import describe_sweep, sweep
@@ -390,7 +391,49 @@ class View(ViewOptions):
         view(self)
 
 
-Command = Train | Eval | Play | Figures | Compare | Agents | View | Sweep
+@dataclasses.dataclass(frozen=True)
+class Reproduce:
+    """Make one page with the tables and figures of James & Johns 2016, measured again.
+
+    Every figure is measured into a file of its own in the folder. A figure that has its file is not
+    measured again, so a command that was stopped continues when it is run again. Without `--runs`
+    and `--shipped` agents A and B are trained first, which takes hours; the number is printed
+    before. The long studies are trained only when `--only` names them.
+
+    Attributes:
+      out: folder of the page.
+      runs: a folder of run folders, or a run folder, whose agents are shown.
+      shipped: show the agents that come with the package where the runs have none.
+      seeds: of each agent that is trained.
+      quick: tiny trainings and few episodes, to prove in minutes that everything works.
+      only: parts to measure: `agents`, `figure1`, `figure2`, `figure3`, `episodes`, `figure4`,
+        `pixels`, `reward`, `paper`, `ablations`, `ablations-B`, `page` (the page alone), or the
+        name of a file in `cells/`.
+    """
+
+    out: pathlib.Path = pathlib.Path("runs/reproduction")
+    runs: pathlib.Path | None = None
+    shipped: bool = False
+    seeds: int = 1
+    quick: bool = False
+    only: tuple[str, ...] = ()
+
+    def run(self, given: frozenset[str]) -> None:
+        """Runs the command."""
+        del given
+        check_device()
+        reproduce(
+            self.out,
+            runs=self.runs,
+            shipped=self.shipped,
+            quick=self.quick,
+            only=self.only,
+            seeds=self.seeds,
+            console=make_console(),
+        )
+
+
+Command = Train | Eval | Play | Figures | Compare | Agents | View | Sweep | Reproduce
 _COMMANDS: dict[str, type[Command]] = {
     "train": Train,
     "eval": Eval,
@@ -400,6 +443,7 @@ _COMMANDS: dict[str, type[Command]] = {
     "agents": Agents,
     "view": View,
     "sweep": Sweep,
+    "reproduce": Reproduce,
 }
 _SUBJECTS = {
     "agent": "an agent's file or a run folder",
@@ -456,6 +500,10 @@ def _parse(arguments: Sequence[str]) -> tuple[Command, frozenset[str]]:
     if kind is Sweep:
         return _parse_train(Sweep, arguments[1:])
     known = _annotations(kind)
+    if kind is Reproduce:
+        values, others = read_arguments(arguments[1:], known)
+        _check_none(others)
+        return Reproduce(**values), frozenset(values)
     subject = next(iter(known))
     values, others = read_arguments(arguments[1:], known | {subject: pathlib.Path})
     return kind(**{**values, **_subject(kind, subject, arguments[0], others)}), frozenset(values)
@@ -525,7 +573,7 @@ def _help(arguments: Sequence[str]) -> NoReturn:
     """Prints the help, which shows the values of the preset, and the options of the task."""
     train_ = Annotated[Train, tyro.conf.subcommand("train", default=_help_of(Train, arguments))]
     sweep_ = Annotated[Sweep, tyro.conf.subcommand("sweep", default=_help_of(Sweep, arguments))]
-    commands: Any = train_ | Eval | Play | Figures | Compare | Agents | View | sweep_
+    commands: Any = train_ | Eval | Play | Figures | Compare | Agents | View | sweep_ | Reproduce
     first = [name for name in arguments[:1] if name in _COMMANDS]
     tyro.cli(
         commands,

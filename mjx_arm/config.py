@@ -160,6 +160,10 @@ class DistillConfig(AlgorithmConfig):
       teacher_hidden: units of each of the teacher's two layers.
       teacher_learning_rate: of the teacher's Adam.
       teacher_polyak: share of the online parameters in each update of its target's.
+      teacher_double: the teacher learns by double Q-learning (van Hasselt et al. 2015).
+      teacher_huber: the teacher's loss is Huber's; else half the squared error.
+      teacher_dueling: the teacher has a value and an advantage stream (Wang et al. 2016).
+      teacher_layer_norm: LayerNorm after each of the teacher's hidden layers.
       student_starts: environment steps before the student's first update.
       student_batch_size: images in one update of the student.
       student_updates_per_step: updates of the student after each step of all environments.
@@ -178,6 +182,10 @@ class DistillConfig(AlgorithmConfig):
     teacher_hidden: Count = 512
     teacher_learning_rate: Positive = 3e-4
     teacher_polyak: Share = 0.005
+    teacher_double: bool = True
+    teacher_huber: bool = True
+    teacher_dueling: bool = True
+    teacher_layer_norm: bool = True
     student_starts: CountOrZero = 1_200_000
     student_batch_size: Count = 64
     student_updates_per_step: Count = 3

@@ -33,11 +33,12 @@ FORBIDDEN = {
     "report": ("presets", "networks", "training", "interop", "cli"),
     "interop": ("config", "presets", "networks", "algos", "training", "report", "cli"),
     "training": ("interop", "cli", "presets"),
-    "tools": ("interop", "cli", "presets", "view"),
-    "view": ("interop", "cli", "presets", "tools"),
+    "tools": ("interop", "cli", "presets", "view", "reproduce"),
+    "view": ("interop", "cli", "presets", "tools", "reproduce"),
+    "reproduce": ("interop", "cli", "view"),
 }
 # Only the command line imports these.
-OUTERMOST = ("tools", "view")
+OUTERMOST = ("tools", "view", "reproduce")
 
 
 def modules(part: str) -> list[pathlib.Path]:

@@ -19,7 +19,7 @@ from matplotlib.ticker import MaxNLocator
 from mjx_arm.report.metrics import read_metrics
 
 # Distinct in greyscale and for colour-blind readers (Okabe & Ito 2008).
-_COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00")
+COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00")
 _X_LABELS = {"episode": "episodes", "env_steps": "environment steps"}
 # Rows that the smoothed line averages over, as a share of all rows.
 _WINDOW = 0.05
@@ -121,12 +121,12 @@ def draw_groups(groups: Mapping[str, Sequence[pathlib.Path]]) -> list[tuple[str,
     for panel, x_name in panels.items():
         figure = Figure(figsize=(4.4, 3.3), layout="constrained")
         axes = figure.subplots()
-        for (name, seeds), colour in zip(runs.items(), itertools.cycle(_COLOURS), strict=False):
+        for (name, seeds), colour in zip(runs.items(), itertools.cycle(COLOURS), strict=False):
             _draw_group(axes, panel, x_name, seeds, name, colour)
         if not any(np.size(line.get_xdata()) for line in axes.get_lines()):
             axes.text(0.5, 0.5, _why_empty(panel), transform=axes.transAxes, ha="center")
         _finish(axes, panel, x_name, legend=True)
-        pictures.append((panel.title, _svg(figure, panel.title)))
+        pictures.append((panel.title, to_svg(figure, panel.title)))
     return pictures
 
 
@@ -141,10 +141,10 @@ def _draw_group(
     """The curves of one run in one colour."""
     curves = [_known(seed, x_name, panel.column) for seed in seeds]
     for x, y in curves:
-        line = y if len(seeds) == 1 else _smooth(y)
+        line = y if len(seeds) == 1 else smooth(y)
         axes.plot(x, line, color=colour, lw=0.8, alpha=0.35)
     if len(seeds) == 1:
-        axes.plot(curves[0][0], _smooth(curves[0][1]), color=colour, lw=1.6, label=name)
+        axes.plot(curves[0][0], smooth(curves[0][1]), color=colour, lw=1.6, label=name)
     elif (spread := _spread(curves)) is not None:
         grid, values = spread
         axes.fill_between(grid, values.min(0), values.max(0), color=colour, alpha=0.15, lw=0)
@@ -217,10 +217,11 @@ def _draw_svg(
 ) -> bytes:
     figure = Figure(figsize=(4.4, 3.3), layout="constrained")
     _draw_panel(figure.subplots(), panel, x_name, runs, names)
-    return _svg(figure, panel.title)
+    return to_svg(figure, panel.title)
 
 
-def _svg(figure: Figure, salt: str) -> bytes:
+def to_svg(figure: Figure, salt: str) -> bytes:
+    """A figure as SVG: the same bytes for the same curves and the same `salt`."""
     content = io.BytesIO()
     # Without a salt the names inside of the file are random.
     with matplotlib.rc_context({"svg.hashsalt": salt}):
@@ -236,12 +237,12 @@ def _draw_panel(
     names: list[str],
 ) -> None:
     empty = True
-    for run, name, colour in zip(runs, names, itertools.cycle(_COLOURS), strict=False):
+    for run, name, colour in zip(runs, names, itertools.cycle(COLOURS), strict=False):
         x, y = _known(run, x_name, panel.column)
         empty &= x.size == 0
         few = x.size < 30
         axes.plot(x, y, color=colour, lw=0.8, alpha=0.35, marker="." if few else "")
-        axes.plot(x, _smooth(y), color=colour, lw=1.6, label=name if len(runs) > 1 else "training")
+        axes.plot(x, smooth(y), color=colour, lw=1.6, label=name if len(runs) > 1 else "training")
         if panel.dots is not None:
             x, y = _known(run, x_name, panel.dots[0])
             label = panel.dots[1] if run is runs[0] and x.size else None
@@ -300,7 +301,7 @@ def _spread(
     if any(x.size < 2 for x, _ in curves):
         return None
     grid = np.linspace(max(x[0] for x, _ in curves), min(x[-1] for x, _ in curves), 200)
-    return grid, np.stack([np.interp(grid, x, _smooth(y)) for x, y in curves])
+    return grid, np.stack([np.interp(grid, x, smooth(y)) for x, y in curves])
 
 
 def _known(run: dict[str, np.ndarray], x_name: str, column: str) -> tuple[np.ndarray, np.ndarray]:
@@ -310,7 +311,7 @@ def _known(run: dict[str, np.ndarray], x_name: str, column: str) -> tuple[np.nda
     return run[x_name][known], run[column][known]
 
 
-def _smooth(values: np.ndarray) -> np.ndarray:
+def smooth(values: np.ndarray) -> np.ndarray:
     """A centred moving mean over a twentieth of the values, shorter at the ends."""
     half = max(1, int(_WINDOW * len(values)) // 2)
     sums = np.concatenate([[0.0], np.cumsum(values)])

@@ -37,13 +37,15 @@ a { color: var(--accent); }
 .curves img { width: 100%; height: auto; background: #fff; border: 1px solid var(--line);
   border-radius: .5rem; }
 video, .wide img { width: 100%; max-width: 48rem; height: auto; border-radius: .5rem; }
-.scroll { overflow-x: auto; }
+.scroll { overflow-x: auto; margin-bottom: .6rem; }
 table { border-collapse: collapse; font-variant-numeric: tabular-nums; }
 th, td { text-align: left; padding: .3rem .9rem .3rem 0; border-bottom: 1px solid var(--line);
   vertical-align: top; }
 .scroll:has(thead) :is(th, td) { white-space: nowrap; }
 thead th { color: var(--quiet); font-weight: 600; font-size: .88rem; }
 tbody th { font-weight: 400; }
+.scroll:has(thead) tbody th { white-space: normal; min-width: 9rem; max-width: 18rem; }
+tbody th code { white-space: nowrap; }
 tr.changed th, tr.changed td { font-weight: 650; }
 .groups { columns: 20rem; column-gap: 2.5rem; }
 .groups section { break-inside: avoid; padding-top: .1rem; }
@@ -52,6 +54,17 @@ td { overflow-wrap: anywhere; }
 code, pre { font: .88rem/1.5 ui-monospace, "DejaVu Sans Mono", monospace; }
 pre { background: var(--card); border: 1px solid var(--line); border-radius: .5rem;
   padding: .7rem .9rem; overflow-x: auto; margin: .4rem 0; }
+figure { margin: .8rem 0 1rem; }
+figure img { background: #fff; border-radius: .4rem; display: block; }
+figure div { overflow-x: auto; }
+.plot img { max-width: 100%; height: auto; }
+@media (max-width: 48rem) { .plot img { max-width: none; } }
+.strip img { max-width: none; }
+figcaption { color: var(--quiet); font-size: .92rem; max-width: 52rem; margin-top: .3rem; }
+.source { font-size: .85rem; overflow-wrap: anywhere; }
+.missing { border-left: .25rem solid var(--accent); padding: .1rem 0 .1rem .9rem; margin: .8rem 0; }
+details { margin: .4rem 0; }
+details pre { max-height: 24rem; overflow: auto; }
 footer { margin-top: 2.5rem; color: var(--quiet); font-size: .88rem; }
 """
 

@@ -72,15 +72,26 @@ class RunResult:
     @property
     def share(self) -> Share | None:
         """The success rate; None if a seed has not been evaluated."""
-        if not self.counts:
-            return None
-        if len(self.counts) == 1:
-            ((successes, episodes),) = self.counts
-            return Share(
-                successes / episodes, *wilson_interval(successes, episodes), over="episodes"
-            )
-        mean, half = _mean_and_half_width([s / n for s, n in self.counts])
-        return Share(mean, max(0.0, mean - half), min(1.0, mean + half), over="seeds")
+        return share_of(self.counts)
+
+
+def share_of(counts: Sequence[tuple[int, int]]) -> Share | None:
+    """The success rate of one or more seeds, with its 95 % interval.
+
+    Args:
+      counts: successes and episodes of each seed.
+
+    Returns:
+      One seed: Wilson's interval, over its episodes. Several: Student's, over the seeds. None
+      where there is no seed.
+    """
+    if not counts:
+        return None
+    if len(counts) == 1:
+        ((successes, episodes),) = counts
+        return Share(successes / episodes, *wilson_interval(successes, episodes), over="episodes")
+    mean, half = _mean_and_half_width([s / n for s, n in counts])
+    return Share(mean, max(0.0, mean - half), min(1.0, mean + half), over="seeds")
 
 
 def read_result(folder: pathlib.Path) -> RunResult:

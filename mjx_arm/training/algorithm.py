@@ -52,16 +52,16 @@ def make_teacher(config: DistillConfig, env: Env, shard: Shard = WHOLE) -> QLear
     network: Any = FeatureQNetwork(
         env.num_actions,
         config.teacher_hidden,
-        dueling=True,
+        dueling=config.teacher_dueling,
         scales=env.feature_scales,
-        layer_norm=True,
+        layer_norm=config.teacher_layer_norm,
     )
     return QLearning(
         apply=network.apply,
         init_params=network.init,
         optimizer=make_adam(config.teacher_learning_rate, 10.0),
-        double=True,
-        huber=True,
+        double=config.teacher_double,
+        huber=config.teacher_huber,
         polyak=config.teacher_polyak,
         target_period=1,
         shard=shard,

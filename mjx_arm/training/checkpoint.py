@@ -22,6 +22,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from mjx_arm.config import dump_config, parse_config
 from mjx_arm.training.memory import tree_size
 from mjx_arm.training.mesh import place
 from mjx_arm.training.processes import is_writer, on_writer
@@ -222,17 +223,27 @@ def _check_origin(path: pathlib.Path, made: dict[str, Any] | None, wanted: Origi
 def config_differences(trained: dict[str, Any], given: dict[str, Any]) -> str:
     """In words, the options in which a configuration differs from a run's; empty if in none.
 
+    An option that is newer than the run counts as having had its default.
+
     Args:
       trained: what the run was trained with, as a JSON object.
       given: what the configuration says now.
     """
-    before, now = (_flat(json.loads(json.dumps(config))) for config in (trained, given))
+    before, now = (_flat(json.loads(json.dumps(x))) for x in (_completed(trained), given))
     names = [name for name in before | now if name not in _FREE]
     return ", ".join(
         f"{name} was {before.get(name)} and is now {now.get(name)}"
         for name in names
         if before.get(name) != now.get(name)
     )
+
+
+def _completed(config: dict[str, Any]) -> dict[str, Any]:
+    """With the defaults of the options that it lacks; as it is where it is no configuration."""
+    try:
+        return dump_config(parse_config(json.dumps(config), "the checkpoint"))
+    except ValueError:
+        return config
 
 
 def _flat(config: dict[str, Any]) -> dict[str, Any]:

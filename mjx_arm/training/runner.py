@@ -26,7 +26,7 @@ from mjx_arm.algos.collect import Counts
 from mjx_arm.config import TrainConfig, advice, set_train_options
 from mjx_arm.devices import check_device
 from mjx_arm.envs.env import make_env
-from mjx_arm.options import Count, Discount, check_value
+from mjx_arm.options import Count, Discount, Positive, check_value
 from mjx_arm.report.figures import plot_curves
 from mjx_arm.report.metrics import MetricsWriter, keep_metrics, last_env_steps, last_wall_s
 from mjx_arm.report.progress import (
@@ -121,6 +121,7 @@ def train(
     *,
     eval_episodes: int = 200,
     stop_at: float | None = None,
+    minutes: float | None = None,
     init_from: str | pathlib.Path | None = None,
     devices: int | None = None,
     on_chunk: OnChunk | None = None,
@@ -142,6 +143,8 @@ def train(
         the time.
       eval_episodes: episodes of the evaluation at the end.
       stop_at: end the run when a selection has reached this success rate for every seed.
+      minutes: end the run after the first chunk that ends later than this; compiling and the
+        evaluation at the end are not counted.
       init_from: an agent whose network the run starts from.
       devices: number of local devices that share the work, as `make_trainer` says; by default as
         many as divide it. 1 is the program for one device.
@@ -161,7 +164,7 @@ def train(
       ValueError: the options do not fit the machine, or the folder cannot be used.
       RunInterruptedError: Ctrl-C, SIGTERM, SIGHUP or SIGUSR1.
     """
-    _check_options(eval_episodes, stop_at)
+    _check_options(eval_episodes, stop_at, minutes)
     console = _own_console(console)
     objects = Objects(env=env, network=network, reward=reward, algorithm=algorithm)
     trainer = _prepare(config, objects, console, devices)
@@ -181,7 +184,7 @@ def train(
             state = place(dataclasses.replace(state, learner=learner), trainer.shapes())
         run = SavedRun(_with_backend(config, trainer), recorded, trainer.env.scene.source)
         on_writer(lambda: save_run(made, run))
-        loop = _Loop(trainer, run, run_chunk, folder, console, stop_at, on_chunk)
+        loop = _Loop(trainer, run, run_chunk, folder, console, stop_at, minutes, on_chunk)
         console.print(f"training: {config.total_steps:,} environment steps")
         loop.run(state, 0)
         ending = _Ending(eval_episodes, console, _local_devices(trainer), video)
@@ -194,8 +197,10 @@ def resume(
     total_steps: int | None = None,
     eval_episodes: int = 200,
     stop_at: float | None = None,
+    minutes: float | None = None,
     devices: int | None = None,
     on_chunk: OnChunk | None = None,
+    video: bool = True,
     console: Console | None = None,
     env: Any = None,
     network: Any = None,
@@ -213,8 +218,10 @@ def resume(
         selection that ended a shorter run is kept.
       eval_episodes: episodes of the evaluation at the end.
       stop_at: end the run when a selection has reached this success rate for every seed.
+      minutes: see `train`; those before it was stopped count.
       devices: see `train`.
       on_chunk: see `train`.
+      video: record an episode at the end.
       console: where it prints.
       env: the environment, if the run was started with one.
       network: the same for the network.
@@ -225,7 +232,7 @@ def resume(
       ValueError: the folder holds no run that can be continued, or an object is not the run's.
       RunInterruptedError: Ctrl-C, SIGTERM, SIGHUP or SIGUSR1.
     """
-    _check_options(eval_episodes, stop_at)
+    _check_options(eval_episodes, stop_at, minutes)
     folder = pathlib.Path(folder)
     console = _own_console(console)
     _check_whole_run(folder)
@@ -257,9 +264,9 @@ def resume(
         run = dataclasses.replace(saved, config=config)
         on_writer(lambda: _continue_files(folder, run, saved, done))
         console.print(f"resuming after {done:,} steps")
-        loop = _Loop(trainer, run, run_chunk, folder, console, stop_at, on_chunk)
+        loop = _Loop(trainer, run, run_chunk, folder, console, stop_at, minutes, on_chunk)
         loop.run(state, vector_step // config.chunk_length)
-        ending = _Ending(eval_episodes, console, _local_devices(trainer))
+        ending = _Ending(eval_episodes, console, _local_devices(trainer), video)
         return _finish_on_writer(folder, run, objects, ending)
 
 
@@ -345,9 +352,10 @@ def _read_policy(trainer: Trainer, path: pathlib.Path) -> Any:
     return flax.traverse_util.unflatten_dict(arrays, sep="/")
 
 
-def _check_options(eval_episodes: int, stop_at: float | None) -> None:
+def _check_options(eval_episodes: int, stop_at: float | None, minutes: float | None) -> None:
     check_value("eval_episodes", Count, eval_episodes)
     check_value("stop_at", Discount | None, stop_at)
+    check_value("minutes", Positive | None, minutes)
 
 
 def _check_whole_run(folder: pathlib.Path) -> None:
@@ -501,6 +509,7 @@ class _Loop:
     folder: pathlib.Path
     console: Console
     stop_at: float | None
+    minutes: float | None
     on_chunk: OnChunk | None
 
     def run(self, state: LoopState, done: int) -> None:
@@ -522,7 +531,8 @@ class _Loop:
                 if self.on_chunk is not None:
                     self.on_chunk(rows, state)
                 reached = self._has_reached(results)
-                last = chunk == config.num_chunks or reached
+                late = self._is_late(rows)
+                last = chunk == config.num_chunks or reached or late
                 asked = any_says(interruption.asked)
                 if last or chunk % _SAVE_EVERY == 0 or asked:
                     # The checkpoint last: what is older than it would not be made again.
@@ -533,6 +543,9 @@ class _Loop:
                     raise RunInterruptedError(f"saved; {_how_to_continue(self.folder)}")
                 if reached:
                     self.console.print(f"stopped: every seed has reached {self.stop_at}")
+                    return
+                if late:
+                    self.console.print(f"stopped: trained for {self.minutes:g} minutes")
                     return
 
     def _results(self, started: float) -> list[_Results]:
@@ -590,6 +603,11 @@ class _Loop:
             for i, result in enumerate(results)
         ]
         return state, rows, params
+
+    def _is_late(self, rows: list[dict[str, float]]) -> bool:
+        if self.minutes is None:
+            return False
+        return any_says(rows[0]["wall_s"] >= 60 * self.minutes)
 
     def _has_reached(self, results: list[_Results]) -> bool:
         if self.stop_at is None:

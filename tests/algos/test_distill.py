@@ -15,6 +15,8 @@ from mjx_arm.algos.dqn import QLearning
 from mjx_arm.algos.frames import Frames
 from mjx_arm.algos.replay import sample
 from mjx_arm.config import DistillConfig, TrainConfig, set_train_options, train_config
+from mjx_arm.envs.env import make_env
+from mjx_arm.training.algorithm import make_teacher
 from mjx_arm.training.loop import (
     Trainer,
     make_body,
@@ -394,3 +396,29 @@ def test_a_whole_run_is_one_function(run):
     pairs = map(jax.tree.leaves, (final.learner, states[2].learner))
     for a, b in zip(*pairs, strict=True):
         np.testing.assert_allclose(a, b, atol=1e-5)
+
+
+def test_the_teacher_has_its_own_options():
+    env = make_env(CONFIG.env)
+    features = jnp.zeros((1, len(env.feature_scales)), jnp.float32)
+
+    def made(**options):
+        teacher = make_teacher(DistillConfig(teacher_hidden=16, **options), env)
+        params = jax.eval_shape(teacher.init_params, jax.random.key(0), features)
+        return teacher, str(jax.tree_util.tree_structure(params))
+
+    usual, names = made()
+    assert usual.double
+    assert usual.huber
+    assert names.count("LayerNorm") == 2
+    assert names.count("Dense") == 4
+    other, names = made(
+        teacher_double=False,
+        teacher_huber=False,
+        teacher_dueling=False,
+        teacher_layer_norm=False,
+    )
+    assert not other.double
+    assert not other.huber
+    assert "LayerNorm" not in names
+    assert names.count("Dense") == 3

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from mjx_arm.config import dump_config, train_config
 from mjx_arm.training.checkpoint import (
     Origin,
     RunCheckpoints,
@@ -181,3 +182,12 @@ def test_a_seal_covers_every_character():
         other = "x" if text[place] != "x" else "y"
         assert not is_sealed(text[:place] + other + text[place + 1 :])
     assert not is_sealed("")
+
+
+def test_an_option_that_is_newer_than_the_run_counts_as_its_default():
+    older = dump_config(train_config(algorithm="distill"))
+    older["algo"].pop("teacher_double")
+    same = dump_config(train_config(algorithm="distill"))
+    assert config_differences(older, same) == ""
+    other = dump_config(train_config(algorithm="distill", teacher_double=False))
+    assert config_differences(older, other) == "teacher_double was True and is now False"

@@ -267,6 +267,24 @@ def test_stop_at_ends_the_run_when_a_selection_reaches_it(tmp_path, monkeypatch)
     assert mjx_arm.load_agent(folder / "last.safetensors").env_steps == 160
 
 
+def test_minutes_end_a_run_and_count_over_its_starts(tmp_path):
+    folder = tmp_path / "run"
+    # Any chunk takes longer than this.
+    _, said = train(folder, minutes=1e-9)
+    assert [row["env_steps"] for row in read_metrics(folder)] == [80]
+    assert "stopped: trained for 1e-09 minutes" in said
+    assert (folder / "evaluation.json").is_file()
+    resume(folder, minutes=1e-9)
+    assert [row["env_steps"] for row in read_metrics(folder)] == [80, 160]
+    resume(folder, minutes=60.0)
+    assert [row["env_steps"] for row in read_metrics(folder)] == [80, 160, 240]
+
+
+def test_minutes_that_are_none_are_refused(tmp_path):
+    with pytest.raises(ValueError, match="minutes must be a finite number above 0 or None"):
+        train(tmp_path / "run", minutes=0.0)
+
+
 @pytest.mark.parametrize("stop_at", [0.0, 1.5, float("nan")])
 def test_a_stop_that_is_no_share_is_refused(stop_at, tmp_path):
     with pytest.raises(

@@ -1,0 +1,38 @@
+"""What a figure was taken on."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import os
+import pathlib
+import platform
+from typing import Any
+
+import jax
+import mujoco
+
+from mjx_arm.cores import usable_cores
+
+
+def machine() -> dict[str, Any]:
+    """Processor, device and versions."""
+    name = platform.processor()
+    cpuinfo = pathlib.Path("/proc/cpuinfo")
+    if cpuinfo.is_file():
+        lines = cpuinfo.read_text().splitlines()
+        name = next((x.split(":")[1].strip() for x in lines if x.startswith("model name")), name)
+    return {
+        "cpu": name,
+        "cores": usable_cores(),
+        "device": jax.devices()[0].device_kind,
+        "python": platform.python_version(),
+        "jax": jax.__version__,
+        "mujoco": mujoco.__version__,
+        "xla_flags": os.environ.get("XLA_FLAGS", ""),
+    }
+
+
+def versions() -> dict[str, str]:
+    """Versions of the packages that figures depend on."""
+    names = ("mjx-arm", "jax", "jaxlib", "mujoco", "mujoco-mjx", "flax", "optax", "numpy")
+    return {name: importlib.metadata.version(name) for name in names}

@@ -1,0 +1,150 @@
+"""What the page is made of, and what it costs."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+
+import pytest
+
+from mjx_arm.cli import main
+from mjx_arm.reproduce.plan import make_plan, strongest_ablations
+from mjx_arm.reproduce.store import Measured, Store
+from mjx_arm.reproduce.trainings import (
+    ABLATION_MINUTES,
+    ABLATIONS,
+    STRONGEST,
+    ablation_training,
+    agent_trainings,
+    paper_training,
+    reward_trainings,
+    shorten,
+)
+
+
+def plan_of(tmp_path, **options):
+    values = {"runs": None, "shipped": False, "quick": False, "only": ()}
+    return make_plan(tmp_path / "page", **(values | options))
+
+
+def test_without_agents_a_and_b_are_trained(tmp_path):
+    names = [training.name for training in plan_of(tmp_path).wanted_trainings()]
+    assert names == ["agent-A-seed0", "agent-B-seed0"]
+    assert len(plan_of(tmp_path, seeds=3).wanted_trainings()) == 6
+
+
+@pytest.mark.parametrize("options", [{"shipped": True}, {"only": ("figure1",)}])
+def test_nothing_is_trained_that_was_not_asked_for(tmp_path, options):
+    assert plan_of(tmp_path, **options).wanted_trainings() == []
+
+
+@pytest.mark.parametrize("section", ["reward", "paper", "ablations", "pixels"])
+def test_a_study_is_trained_when_it_is_named(tmp_path, section):
+    plan = plan_of(tmp_path, shipped=True, only=(section,))
+    assert plan.wanted_trainings()
+    assert section not in plan_of(tmp_path, shipped=True).chosen
+
+
+def test_one_cell_can_be_asked_for(tmp_path):
+    plan = plan_of(tmp_path, shipped=True, only=("ablation-A-gamma",))
+    assert [training.name for training in plan.wanted_trainings()] == ["ablation-A-gamma"]
+
+
+def test_the_budgets_are_those_of_the_study():
+    tried = [each for each in ABLATIONS if each.changes is not None]
+    cells = len(tried) + 1 + STRONGEST + 1
+    assert ABLATION_MINUTES <= 15
+    assert cells * ABLATION_MINUTES <= 180
+    for ablation in tried:
+        for env in ("A", "B"):
+            training = ablation_training(ablation.name, env)
+            assert training.minutes == ABLATION_MINUTES
+            assert training.config.env.env == env
+    assert paper_training().config.total_steps == 1_000_000
+    assert paper_training().config.exploration.epsilon_steps == 1_000_000
+
+
+def test_rewards_differ_in_nothing_but_the_reward_and_the_discount():
+    runs = [training.config for training in reward_trainings()]
+    assert {config.env.env for config in runs} == {"A"}
+    bare = {
+        dataclasses.replace(
+            config,
+            seed=0,
+            env=dataclasses.replace(config.env, reward="completion"),
+            algo=dataclasses.replace(config.algo, gamma=0.99),
+        )
+        for config in runs
+    }
+    assert len(bare) == 1
+    assert sorted({config.seed for config in runs}) == [0, 1]
+
+
+def test_every_training_has_hours_and_a_quick_form():
+    for training in (*agent_trainings("agents"), *reward_trainings(), paper_training()):
+        assert 0.1 < training.hours < 5
+        quick = shorten(training)
+        assert quick.config.total_steps < 20_000
+        assert quick.hours < 0.05
+
+
+def write_rate(store: Store, name: str, rate: float) -> None:
+    store.write(Measured(name, "", {}, {"rate": rate}, (), {}, 0.0, ""), {})
+
+
+def test_the_strongest_changes_are_known_when_all_are_measured(tmp_path):
+    store = Store(tmp_path)
+    store.prepare()
+    rates = {"gamma": 0.2, "loss": 0.95, "replay": 0.5}
+    write_rate(store, "ablation-A-default", 0.8)
+    for ablation in ABLATIONS:
+        if ablation.changes is not None:
+            assert strongest_ablations(store) == []
+            write_rate(store, f"ablation-A-{ablation.name}", rates.get(ablation.name, 0.8))
+    assert strongest_ablations(store) == ["gamma", "replay", "loss"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--only", "figur1"], "unknown section or cell 'figur1': did you mean 'figure1'?"),
+        (["--runs", "nowhere"], "--runs nowhere is not a folder"),
+        (["--runs", "."], "--runs . holds no run folder"),
+        (["--out", "file", "--shipped", "--only", "page"], "cannot be made"),
+        (["--seeds", "0"], "seeds must be a whole number of at least 1"),
+        (["page"], "unexpected argument 'page'"),
+        (["--quik"], "unknown option '--quik': did you mean '--quick'?"),
+    ],
+)
+def test_bad_input_gets_one_sentence(arguments, message, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "file").write_text("")
+    assert main(["reproduce", *arguments]) == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") == 1
+
+
+def test_a_page_without_any_cell_names_every_command(tmp_path, capsys):
+    out = tmp_path / "page"
+    assert main(["reproduce", "--shipped", "--only", "page", "--out", str(out)]) == 0
+    page = (out / "index.html").read_text()
+    for part in (
+        *("figure1-arm_cube", "figure2-teacher-A-seed0", "episodes-teacher-B-seed0-in-A"),
+        *("figure4-teacher-B-seed0", "reward-published-seed0", "paper-A", "ablation-A-gamma"),
+        "mjx-arm transfer AGENT --level near",
+    ):
+        assert part in page
+    assert f"--shipped --out {out}" in page
+    assert "http" not in page.replace("http-equiv", "")
+    assert (out / "index.md").is_file()
+
+
+def test_options_of_a_cell_that_changed_make_it_missing(tmp_path):
+    plan = plan_of(tmp_path, shipped=True)
+    plan.store.prepare()
+    cell = next(cell for cell in plan.cells if cell.name.startswith("episodes-"))
+    inputs = json.loads(json.dumps(cell.inputs()))
+    plan.store.write(Measured(cell.name, "", inputs, {}, (), {}, 0.0, ""), {})
+    assert plan.read(cell.name) is not None
+    assert plan_of(tmp_path, shipped=True, quick=True).read(cell.name) is None

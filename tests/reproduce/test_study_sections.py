@@ -1,0 +1,141 @@
+"""The parts of the page about the studies, from files as the measurements leave them."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+from made_runs import make_run
+
+from mjx_arm.reproduce.curves import read_curve
+from mjx_arm.reproduce.page import page_blocks, write_pages
+from mjx_arm.reproduce.plan import make_plan
+from mjx_arm.reproduce.records import CAUSES, HEIGHT_EDGES
+from mjx_arm.reproduce.store import Measured
+from mjx_arm.reproduce.studies import measure_ablation
+from mjx_arm.reproduce.trainings import ABLATIONS
+from mjx_arm.training.evaluate import wilson_interval
+
+
+@pytest.fixture
+def run(tmp_path):
+    make_run(tmp_path / "run", (90,), env="A")
+    return tmp_path / "run"
+
+
+def plan_of(out):
+    return make_plan(out, runs=None, shipped=True, quick=False, only=())
+
+
+def write(plan, name, result):
+    """A cell with the inputs that the plan wants."""
+    (cell,) = [cell for cell in plan.cells if cell.name == name]
+    inputs = json.loads(json.dumps(cell.inputs()))
+    plan.store.write(Measured(name, "", inputs, result, (), MACHINE, 1.0, "2026-01-01"), {})
+
+
+MACHINE = {
+    "cpu": "a processor",
+    "cores": 2,
+    "device": "cpu",
+    "python": "3.11",
+    "xla_flags": "",
+    "versions": {"jax": "0.10"},
+}
+
+
+def trial(successes, episodes=100):
+    """What `measure_episodes` says of episodes in which the cube was held at 25 cm."""
+    steps = [0] * (len(HEIGHT_EDGES) - 1)
+    steps[25] = 40
+    return {
+        "episodes": episodes,
+        "successes": successes,
+        "rate": successes / episodes,
+        "ci95": list(wilson_interval(successes, episodes)),
+        "held_not_lifted": episodes - successes,
+        "causes": dict.fromkeys(CAUSES, 0),
+        "heights": {
+            "edges": list(HEIGHT_EDGES),
+            "steps": steps,
+            "grasped_steps": 40,
+            "all_steps": 100,
+            "hovering_steps": 30,
+        },
+    }
+
+
+def reward_result(run, seed, gamma, hovering, successes):
+    worth = {"a_step_of_hovering": hovering, "hovering_for_ever": hovering / (1 - gamma)}
+    return trial(successes) | {
+        "gamma": gamma,
+        "train_seed": seed,
+        "worth": worth | {"success": 100.0},
+        "curve": read_curve(run, 0.2),
+    }
+
+
+def text_of(plan):
+    write_pages(plan)
+    return (plan.store.folder / "index.md").read_text()
+
+
+def test_the_reward_is_worth_what_the_calculation_says(tmp_path, run):
+    plan = plan_of(tmp_path / "page")
+    plan.store.prepare()
+    for seed in (0, 1):
+        result = reward_result(run, seed, 0.99, 1.325, 20 + seed)
+        write(plan, f"reward-published-seed{seed}", result)
+    write(plan, "reward-published-98-seed0", reward_result(run, 0, 0.98, 1.325, 95))
+    text = text_of(plan)
+    assert "| published, γ = 0.99 | 1.325 / (1 - 0.99) = 132.5 | 100 | hover | 10.0 |" in text
+    assert "| published, γ = 0.98 | 1.325 / (1 - 0.98) = 66.2 | 100 | finish | 10.0 |" in text
+    assert "| 20.0 % | 13.3 to 28.9 | 40.0 % | 30.0 % | 80.0 % |" in text
+    assert "![Histograms of the cube's height" in text
+    # What is not there is named.
+    assert "Not measured yet: `reward-completion-seed0`" in text
+    assert (
+        "--only reward-completion-seed0 reward-completion-seed1 reward-published-98-seed1" in text
+    )
+
+
+def test_the_preset_paper_is_reported_both_ways(tmp_path, run):
+    plan = plan_of(tmp_path / "page")
+    plan.store.prepare()
+    trials = {"epsilon 0.1": trial(2), "greedy": trial(0)}
+    write(plan, "paper-A", {"curve": read_curve(run, 1.0), "trials": trials})
+    text = text_of(plan)
+    assert "| ε = 0.1 | 2.0 % |" in text
+    assert "| greedy | 0.0 % |" in text
+
+
+def test_each_change_has_its_difference_and_a_sentence(tmp_path, run):
+    plan = plan_of(tmp_path / "page")
+    plan.store.prepare()
+    result, _ = measure_ablation(run)
+    write(plan, "ablation-A-default", result)
+    for ablation in ABLATIONS:
+        if ablation.changes is not None:
+            worse = result | {"successes": 50, "rate": 0.5}
+            write(plan, f"ablation-A-{ablation.name}", worse if ablation.name == "loss" else result)
+    # Now the strongest are known, and are planned in B.
+    plan = plan_of(tmp_path / "page")
+    text = text_of(plan)
+    assert "| the default preset | 90.0 % | 82.6 to 94.5 | – | 60,000 | the reference |" in text
+    assert "| 50.0 % | 40.4 to 59.6 | -40.0 (" in text
+    assert "Worse than the default in this seed." in text
+    assert "No clear difference." in text
+    assert "Not tried: a distributional head." in text
+    assert "`ablation-B-default`, `ablation-B-loss`" in text
+    assert "| ablation-A-gamma | fast | 0 | `gamma` 0.98 |" in text
+
+
+def test_transfer_is_shown_when_its_files_are_there(tmp_path):
+    plan = plan_of(tmp_path / "page")
+    plan.store.prepare()
+    path = plan.store.folder / "cells" / "transfer-near.json"
+    path.write_text(json.dumps({"rate": 0.8, "ci95": [0.7, 0.9]}))
+    text = text_of(plan)
+    assert "| near | 80.0 % | 70.0 to 90.0 |" in text
+    assert "at medium, far" in text
+    assert list(page_blocks(plan))
