@@ -580,8 +580,12 @@ class Deploy(_Real):
         )
         guard = make_guard(agent.env.scene, agent.env.arm, self.workspace)
         path = self.log or pathlib.Path(f"deploy-{time.strftime('%Y%m%d-%H%M%S')}.jsonl")
-        header = {"agent": str(self.agent), "robot": self.robot, "level": self.level}
-        header |= {"options": dataclasses.asdict(config), "limits": guard.limits.tolist()}
+        header: dict[str, Any] = {"agent": str(self.agent), "robot": self.robot}
+        header |= {
+            "level": self.level,
+            "options": dataclasses.asdict(config),
+            "limits": guard.limits.tolist(),
+        }
         with (
             stop_on_signals() as stop,
             self._connect(agent) as (robot, until),
@@ -641,7 +645,7 @@ class Export:
         check_device()
         check_path(self.out)
         # ONNX has convolutions; ours are matrix products over patches on a CPU.
-        options = {"convolution": "nn.Conv"} if self.format == "onnx" else {}
+        options: dict[str, Any] = {"convolution": "nn.Conv"} if self.format == "onnx" else {}
         agent = load_agent(self.agent, scene=STORED, **options)
         write_policy(agent, self.out, self.format)
         print(f"{self.out}: image {list(image_shape(agent))}, {agent.env.num_actions} actions")

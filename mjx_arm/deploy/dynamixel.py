@@ -10,6 +10,7 @@ not with an arm.
 
 from __future__ import annotations
 
+import functools
 import json
 import pathlib
 from collections.abc import Callable, Sequence
@@ -281,9 +282,8 @@ class DynamixelRobot:
         for servo in self.config.joints:
             if result != self._sdk.COMM_SUCCESS:
                 break
-            data, result, error = self._guarded(
-                lambda servo=servo: self._packets.readRx(self._port, servo, size)
-            )
+            receive = functools.partial(self._packets.readRx, self._port, servo, size)
+            data, result, error = self._guarded(receive)
             positions.append(int.from_bytes(bytes(data[:size]), "little", signed=True))
             if error & _ALERT:
                 alerts.append(servo)

@@ -54,7 +54,7 @@ class Guard:
         """
         count = len(self.limits)
         if not isinstance(angles, np.ndarray) or angles.shape != (count,):
-            shape = list(np.shape(angles))  # type: ignore[arg-type]
+            shape = list(getattr(angles, "shape", ()))
             raise RobotError(f"the robot must report {count} joint angles, got the shape {shape}")
         for joint, angle in enumerate(angles.tolist()):
             low, high = self.limits[joint]

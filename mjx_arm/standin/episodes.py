@@ -115,7 +115,9 @@ class Runner:
     def run(self, number: int, start: Start, film: Film | None = None) -> Trace:
         """Runs one episode; its random actions depend on its number and the job's seed."""
         rng = np.random.default_rng([self.job.seed, number])
-        world, moments, actions = self.world, [], []
+        world = self.world
+        moments: list[Moment] = []
+        actions: list[int] = []
         world.reset(start.qpos, start.ctrl)
         states = [world.measure()]
         while len(actions) < self.job.iterations and not (states[-1].success or world.diverged):

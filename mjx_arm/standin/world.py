@@ -151,7 +151,7 @@ class StandIn:
         self._grasps = jax.jit(lambda poses, ctrl: grasped(self._task, poses, ctrl))
         self._cameras = Cameras(
             self.model,
-            env.cameras,
+            env.config.cameras,
             env.config.size,
             colour=colour_matrix(offsets, self.model.nbody),
             shadows=shadows,

@@ -31,7 +31,7 @@ from mjx_arm.standin.world import StandIn
 from mjx_arm.tools.transfer import NEAR_CUBE
 from mjx_arm.training.agent import Agent
 
-_LAYERS = (PatchConv, nn.Conv, nn.Dense)
+_LAYERS = (PatchConv, nn.Conv, nn.Dense, nn.LayerNorm)
 _MOST_MAPS = 16
 
 
@@ -41,7 +41,7 @@ class Layer:
 
     Attributes:
       name: as flax has it.
-      simulated: `[...] float32`, its output for the simulator's image, after a rectifier.
+      simulated: `[...] float32`, its output for the simulator's image; see `layer_outputs`.
       real: the same for the stand-in's image.
       similarity: cosine of the two.
       yardstick: mean cosine of the simulated image's output and that of other moments.
@@ -81,31 +81,33 @@ def cosine(one: np.ndarray, other: np.ndarray) -> float:
 
 
 def layer_outputs(agent: Agent, images: np.ndarray) -> dict[str, np.ndarray]:
-    """Outputs of a network's convolutions and dense layers after a rectifier, `[N, ...]` each.
+    """Outputs of a network's layers after a rectifier, `[N, ...]` each, in the network's order.
+
+    Layers are convolutions, hidden dense layers and LayerNorms. The last one is `Q-values`, less
+    their mean and without a rectifier.
 
     Args:
       agent: that sees pixels.
       images: `[N, H, W, 3] uint8`.
-
-    Raises:
-      ValueError: the network has no such layer.
     """
     network: Any = getattr(agent.algorithm, "network", None) or make_network(
         agent.config.network, num_actions=agent.env.num_actions, feature_scales=None
     )
+    order: list[str] = []
 
-    def capture(obs: jax.Array) -> Any:
+    def capture(obs: jax.Array) -> tuple[jax.Array, dict[str, jax.Array]]:
         keep = lambda module, _: isinstance(module, _LAYERS)  # noqa: E731
-        _, state = network.apply(agent.params, obs, capture_intermediates=keep)
-        return state["intermediates"]
+        q, state = network.apply(agent.params, obs, capture_intermediates=keep)
+        found = dict(_flat(state["intermediates"]))
+        order[:] = found  # jit sorts the names
+        return q, found
 
-    outputs = {
-        name: np.asarray(jax.nn.relu(x))
-        for name, x in _flat(jax.jit(capture)(as_observations(agent, images)))
-    }
-    if not outputs:
-        raise ValueError("the network has no convolution and no dense layer")
-    return outputs
+    q, found = jax.jit(capture)(as_observations(agent, images))
+    # Dense layers that end in Q-values or in a value are no features.
+    ends = (1, agent.env.num_actions)
+    names = [x for x in order if found[x].ndim > 2 or found[x].shape[-1] not in ends]
+    outputs = {name: np.asarray(jax.nn.relu(found[name])) for name in names}
+    return outputs | {"Q-values": np.asarray(q - q.mean(axis=-1, keepdims=True))}
 
 
 def _flat(tree: Any, prefix: str = "") -> list[tuple[str, Any]]:
@@ -225,9 +227,10 @@ def draw_comparisons(comparisons: Sequence[tuple[str, Comparison]]) -> bytes:
         _show(grid[row], comparison.simulated, comparison.real, f"{name}\nimage", colour=True)
         row += 1
         for layer in comparison.layers:
-            pictures = [_tiles(x) for x in (layer.simulated, layer.real)]
+            chosen = _strongest(layer.simulated)
+            one, other = (_tiles(x[..., chosen]) for x in (layer.simulated, layer.real))
             words = f"{layer.name.split('/')[-1]}\n{layer.similarity:.3f}\n({layer.yardstick:.3f})"
-            _show(grid[row], *pictures, words)
+            _show(grid[row], one, other, words)
             row += 1
     grid[0][0].set_title("simulator", fontsize=10)
     grid[0][1].set_title("stand-in for reality", fontsize=10)
@@ -241,13 +244,21 @@ def draw_comparisons(comparisons: Sequence[tuple[str, Comparison]]) -> bytes:
 
 
 def _show(axes: Any, one: np.ndarray, other: np.ndarray, words: str, colour: bool = False) -> None:
-    largest = None if colour else max(float(one.max()), float(other.max())) or 1.0
-    options = {} if colour else {"cmap": "viridis", "vmin": 0, "vmax": largest}
+    # One scale for both worlds.
+    low, high = min(one.min(), other.min()), max(one.max(), other.max())
+    options = {} if colour else {"cmap": "viridis", "vmin": low, "vmax": high}
     for axis, picture in zip(axes, (one, other), strict=True):
         axis.imshow(picture, interpolation="nearest", **options)
         axis.set_xticks([])
         axis.set_yticks([])
     axes[0].set_ylabel(words, fontsize=8, rotation=0, ha="right", va="center")
+
+
+def _strongest(x: np.ndarray) -> np.ndarray:
+    """The channels of maps `[H, W, C]` that are shown; all of a vector."""
+    if x.ndim != 3:
+        return np.arange(x.shape[-1])
+    return np.sort(np.argsort(-x.max(axis=(0, 1)), kind="stable")[:_MOST_MAPS])
 
 
 def _tiles(x: np.ndarray) -> np.ndarray:
@@ -256,8 +267,7 @@ def _tiles(x: np.ndarray) -> np.ndarray:
         flat = x.ravel()
         half = -(-len(flat) // 2)
         return np.pad(flat, (0, 2 * half - len(flat))).reshape(2, half)
-    maps = x[..., np.argsort(-x.max(axis=(0, 1)), kind="stable")[:_MOST_MAPS]]
-    maps = np.pad(np.moveaxis(maps, -1, 0), ((0, 0), (0, 1), (0, 1)))
+    maps = np.pad(np.moveaxis(x, -1, 0), ((0, 0), (0, 1), (0, 1)))
     half = -(-len(maps) // 2)
     maps = np.concatenate([maps, np.zeros((2 * half - len(maps), *maps.shape[1:]))])
     return np.concatenate([np.concatenate(list(part), axis=1) for part in np.split(maps, 2)])

@@ -208,7 +208,8 @@ def _simulate(
         return {name: measured[name] for name in ("distance", "height", "grasped")}
 
     def step(states: Any, key: jax.Array) -> tuple[Any, tuple[Any, ...]]:
-        q = agent.apply(params, jax.vmap(env.observe)(states))
+        obs: Any = jax.vmap(env.observe)(states)
+        q = agent.apply(params, obs)
         action = epsilon_greedy(key, q, jnp.float32(epsilon))
         after, transition = jax.vmap(env.transition)(states, action)
         ended = transition.terminated | transition.truncated
@@ -254,7 +255,7 @@ class VideoFilm:
     def _frames(
         self, world: StandIn, moments: Sequence[Moment], trace: Trace
     ) -> Iterator[np.ndarray]:
-        camera = Cameras(world.model, world.env.cameras[:1], (_EDGE, _EDGE), scale=1)
+        camera = Cameras(world.model, world.env.config.cameras[:1], (_EDGE, _EDGE), scale=1)
         rows, columns = (np.arange(_EDGE) * edge // _EDGE for edge in world.env.config.size)
         data = world.data
         for step, moment in enumerate(moments):
