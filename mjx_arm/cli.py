@@ -25,7 +25,7 @@ from mjx_arm.algos.exploration import check_epsilon
 from mjx_arm.arguments import read_arguments
 from mjx_arm.config import TrainConfig, set_train_options
 from mjx_arm.deploy.camera import VideoCamera
-from mjx_arm.deploy.dynamixel import DynamixelRobot, read_config
+from mjx_arm.deploy.dynamixel import DynamixelConfig, DynamixelRobot, read_config
 from mjx_arm.deploy.guard import make_guard
 from mjx_arm.deploy.log import Log, replay
 from mjx_arm.deploy.loop import LoopConfig, describe_outcome, run_loop, stop_on_signals
@@ -564,6 +564,7 @@ class Deploy(_Real):
         del given
         if self.robot == "dynamixel" and self.arm is None:
             raise ValueError("--robot dynamixel needs --arm FILE, which describes the arm")
+        arm = None if self.arm is None else read_config(self.arm)
         agent = self.load()
         policy = Policy(export_policy(agent))
         if self.replay is not None:
@@ -588,7 +589,7 @@ class Deploy(_Real):
         }
         with (
             stop_on_signals() as stop,
-            self._connect(agent) as (robot, until),
+            self._connect(agent, arm) as (robot, until),
             Log(path, {**header, "workspace": guard.box.tolist()}) as log,
         ):
             outcome = run_loop(robot, policy, guard, config, log, stop=stop, until=until)
@@ -598,12 +599,13 @@ class Deploy(_Real):
         return {"done": 0, "stopped": 130, "fault": 2}[outcome.ending]
 
     @contextlib.contextmanager
-    def _connect(self, agent: Agent) -> Iterator[tuple[Robot, Callable[[], bool] | None]]:
+    def _connect(
+        self, agent: Agent, arm: DynamixelConfig | None
+    ) -> Iterator[tuple[Robot, Callable[[], bool] | None]]:
         """The robot, and what says that the task is done, if anything does."""
         with contextlib.ExitStack() as stack:
             if self.robot == "dynamixel":
-                assert self.arm is not None
-                arm = read_config(self.arm)
+                assert arm is not None
                 camera = VideoCamera(arm.camera, agent.env.config.size)
                 stack.callback(camera.close)
                 yield stack.enter_context(DynamixelRobot(arm, camera.frame)), None

@@ -1,4 +1,4 @@
-"""A camera that imageio reads: a webcam (`<video0>`), or a video file in its place."""
+"""A camera that ffmpeg reads: a video device of Linux, or a video in its place."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class VideoCamera:
     """Reads a camera in a thread, and keeps its newest image, scaled down to what the agent sees.
 
     Args:
-      uri: `<video0>` for the first webcam, or the path of a video.
+      source: path of a video device, such as `/dev/video0`, or of a video.
       size: height and width of an image, pixels. The middle of the camera's image with this aspect
         is scaled down by averaging.
 
@@ -27,38 +27,44 @@ class VideoCamera:
       RobotError: there is no such camera.
     """
 
-    def __init__(self, uri: str, size: tuple[int, int]) -> None:
+    def __init__(self, source: str, size: tuple[int, int]) -> None:
         # Without this, ffmpeg is forked from a process with many threads, and may deadlock.
         os.environ.setdefault("IMAGEIO_FFMPEG_NO_PREVENT_SIGINT", "1")
-        import imageio.v2 as imageio
+        import imageio_ffmpeg
 
         self._size = size
+        options = ["-f", "v4l2"] if source.startswith("/dev/") else []
+        frames = imageio_ffmpeg.read_frames(source, input_params=options)
         try:
-            self._reader: Any = imageio.get_reader(uri, "ffmpeg")
-        except Exception as error:  # imageio has no error of its own
+            # Of the first frame on the description alone; width and height.
+            self._shape: tuple[int, int] = next(frames)["size"]
+        except Exception as error:  # a device that is busy, a file that is no video, ...
             reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-            raise RobotError(f"the camera {uri!r} cannot be read: {reason}") from error
+            raise RobotError(f"the camera {source!r} cannot be read: {reason}") from error
         self._lock = threading.Condition()
         self._frame: Frame | None = None
         self._error = ""
-        self._ended = False
-        self._thread = threading.Thread(target=self._read, daemon=True)
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._read, args=(frames,), daemon=True)
         self._thread.start()
 
-    def _read(self) -> None:
-        number = 0
+    def _read(self, frames: Any) -> None:
+        (width, height), number = self._shape, 0
+        reason = "the camera has ended"
         try:
-            for large in self._reader:
-                if self._ended:
+            for data in frames:
+                if self._ended.is_set():
                     break
-                frame = Frame(scale_down(np.asarray(large), self._size), time.monotonic(), number)
+                large = np.frombuffer(data, np.uint8).reshape(height, width, 3)
+                frame = Frame(scale_down(large, self._size), time.monotonic(), number)
                 number += 1
                 with self._lock:
                     self._frame = frame
                     self._lock.notify_all()
-            reason = "the camera has ended"
         except Exception as error:
             reason = f"the camera has failed: {str(error).splitlines()[0]}"
+        finally:
+            frames.close()
         with self._lock:
             self._error = reason
             self._lock.notify_all()
@@ -78,8 +84,7 @@ class VideoCamera:
 
     def close(self) -> None:
         """Frees the camera."""
-        self._ended = True
-        self._reader.close()
+        self._ended.set()
         self._thread.join(_PATIENCE)
 
 

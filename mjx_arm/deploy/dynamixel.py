@@ -69,7 +69,7 @@ class DynamixelConfig:
       gripper_current: limit of its current in the current-based position mode, units of 2.69 mA.
       profile_velocity: limit of the joints' speed, units of 0.229 rev/min; 0 for none.
       profile_acceleration: limit of their acceleration, units of 214.577 rev/min2; 0 for none.
-      camera: `<video0>` for the first webcam, or the path of a video.
+      camera: path of a video device, or of a video.
     """
 
     port: str = "/dev/ttyUSB0"
@@ -83,7 +83,7 @@ class DynamixelConfig:
     gripper_current: Count = 200
     profile_velocity: Annotated[int, Field(ge=0, le=32767)] = 60
     profile_acceleration: Annotated[int, Field(ge=0, le=32767)] = 30
-    camera: str = "<video0>"
+    camera: str = "/dev/video0"
 
     def check(self) -> None:
         """Refuses lists of different lengths, and ids that occur twice."""

@@ -21,9 +21,10 @@ from mjx_arm.standin.opengl import NO_OPENGL
 from mjx_arm.varies import own_params
 
 # A camera's pixel is the mean of this many rendered pixels in each direction.
-_SCALE = 4
-# Of the shadows' texture. At 4096, the value of the scenes, clearing it costs more than the image.
-_SHADOW_SIZE = 1024
+_SCALE = 3
+# Of the shadows' texture, a few millimetres a texel. At 4096, the value of the scenes, the shadows
+# take longer than all else.
+_SHADOW_SIZE = 512
 
 _WARNINGS = (
     mujoco.mjtWarning.mjWARN_BADQPOS,

@@ -210,6 +210,14 @@ def test_the_file_of_an_arm_is_read(tmp_path) -> None:
         read_config(path)
 
 
+def wait_for_the_end(camera: VideoCamera) -> None:
+    with camera._lock:
+        assert camera._lock.wait_for(lambda: camera._error, 60)
+    assert camera._error == "the camera has ended"
+
+
+# imageio-ffmpeg leaves its pipes to the garbage collector.
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 def test_a_camera_gives_what_the_agent_sees(tmp_path) -> None:
     video = tmp_path / "camera.mp4"
     grey = [np.full((96, 128, 3), value, np.uint8) for value in (40, 80, 120)]
@@ -218,6 +226,7 @@ def test_a_camera_gives_what_the_agent_sees(tmp_path) -> None:
     first = camera.frame()
     assert first.image.shape == (8, 8, 3)
     assert first.image.dtype == np.uint8
+    wait_for_the_end(camera)
     camera.close()
     assert camera.frame().image.mean() == pytest.approx(120, abs=6)
     with pytest.raises(RobotError, match="cannot be read"):
