@@ -11,14 +11,17 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import pathlib
+import sys
 from typing import Any
 
 import numpy as np
 from machine import machine
 
 from mjx_arm.standin.levels import LEVELS, find_level
-from mjx_arm.tools.feature_maps import Comparison, compare_moment, draw_comparisons, to_json
+from mjx_arm.standin.opengl import find_opengl
+from mjx_arm.tools.feature_maps import Comparison, compare_moments, draw_comparisons, to_json
 from mjx_arm.tools.transfer import ITERATIONS, sample_starts
 from mjx_arm.training.agent import load_agent
 
@@ -46,6 +49,10 @@ def main() -> None:
     parser.add_argument("--scene", help="by default the one that an agent was trained in")
     parser.add_argument("--out", type=pathlib.Path, required=True, help="folder for the files")
     options = parser.parse_args()
+    if not os.environ.get("MUJOCO_GL") and find_opengl():
+        # MuJoCo chooses its OpenGL when it is imported: once more, with one without a screen.
+        os.environ["MUJOCO_GL"] = find_opengl()
+        os.execv(sys.executable, [sys.executable, *sys.orig_argv[1:]])
     options.out.mkdir(parents=True, exist_ok=True)
     rows: dict[str, Any] = {}
     pictures = []
@@ -54,7 +61,7 @@ def main() -> None:
         name = name or pathlib.Path(path).stem
         agent = load_agent(path, max_steps=ITERATIONS, scene=options.scene)
         starts = sample_starts(agent.env, SEED, options.starts)
-        found = [compare_moment(agent, find_level(options.level), start) for start in starts]
+        found = compare_moments(agent, find_level(options.level), starts)
         pictures.append((name, found[0]))
         rows[name] = {"picture": to_json(found[0]), "mean": means(found), "moments": len(found)}
         print(name, json.dumps(rows[name]["mean"]), flush=True)

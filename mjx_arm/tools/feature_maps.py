@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import dataclasses
 import io
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import flax.linen as nn
@@ -28,7 +28,7 @@ from mjx_arm.render.packing import NO_GEOM, pack
 from mjx_arm.standin.episodes import Start
 from mjx_arm.standin.levels import Offsets
 from mjx_arm.standin.world import StandIn
-from mjx_arm.tools.transfer import NEAR_CUBE
+from mjx_arm.tools.transfer import ITERATIONS, NEAR_CUBE
 from mjx_arm.training.agent import Agent
 
 _LAYERS = (PatchConv, nn.Conv, nn.Dense, nn.LayerNorm)
@@ -41,7 +41,7 @@ class Layer:
 
     Attributes:
       name: as flax has it.
-      simulated: `[...] float32`, its output for the simulator's image; see `layer_outputs`.
+      simulated: `[...] float32`, its output for the simulator's image; see `make_layer_outputs`.
       real: the same for the stand-in's image.
       similarity: cosine of the two.
       yardstick: mean cosine of the simulated image's output and that of other moments.
@@ -80,34 +80,37 @@ def cosine(one: np.ndarray, other: np.ndarray) -> float:
     return float(one @ other) / size if size else 0.0
 
 
-def layer_outputs(agent: Agent, images: np.ndarray) -> dict[str, np.ndarray]:
-    """Outputs of a network's layers after a rectifier, `[N, ...]` each, in the network's order.
+def make_layer_outputs(agent: Agent) -> Callable[[np.ndarray], dict[str, np.ndarray]]:
+    """Makes `images [N, H, W, 3] uint8 -> outputs of the network's layers, [N, ...] float32 each`.
 
-    Layers are convolutions, hidden dense layers and LayerNorms. The last one is `Q-values`, less
-    their mean and without a rectifier.
+    Layers are convolutions, hidden dense layers and LayerNorms, in the network's order, each after
+    a rectifier. The last one is `Q-values`, less their mean and without a rectifier.
 
     Args:
       agent: that sees pixels.
-      images: `[N, H, W, 3] uint8`.
     """
     network: Any = getattr(agent.algorithm, "network", None) or make_network(
         agent.config.network, num_actions=agent.env.num_actions, feature_scales=None
     )
     order: list[str] = []
 
+    @jax.jit
     def capture(obs: jax.Array) -> tuple[jax.Array, dict[str, jax.Array]]:
         keep = lambda module, _: isinstance(module, _LAYERS)  # noqa: E731
         q, state = network.apply(agent.params, obs, capture_intermediates=keep)
         found = dict(_flat(state["intermediates"]))
         order[:] = found  # jit sorts the names
-        return q, found
+        return q, {name: jax.nn.relu(x) for name, x in found.items()}
 
-    q, found = jax.jit(capture)(as_observations(agent, images))
-    # Dense layers that end in Q-values or in a value are no features.
-    ends = (1, agent.env.num_actions)
-    names = [x for x in order if found[x].ndim > 2 or found[x].shape[-1] not in ends]
-    outputs = {name: np.asarray(jax.nn.relu(found[name])) for name in names}
-    return outputs | {"Q-values": np.asarray(q - q.mean(axis=-1, keepdims=True))}
+    def outputs(images: np.ndarray) -> dict[str, np.ndarray]:
+        q, found = capture(as_observations(agent, images))
+        # Dense layers that end in Q-values or in a value are no features.
+        ends = (1, agent.env.num_actions)
+        names = [x for x in order if found[x].ndim > 2 or found[x].shape[-1] not in ends]
+        named = {name: np.asarray(found[name]) for name in names}
+        return named | {"Q-values": np.asarray(q - q.mean(axis=-1, keepdims=True))}
+
+    return outputs
 
 
 def _flat(tree: Any, prefix: str = "") -> list[tuple[str, Any]]:
@@ -129,9 +132,14 @@ def as_observations(agent: Agent, images: np.ndarray) -> jax.Array:
     return pack(red, green, blue, jnp.full(red.shape, NO_GEOM, jnp.uint32))
 
 
-def compare_moment(
-    agent: Agent, offsets: Offsets, start: Start, *, shadows: bool = True, others: int = 8
-) -> Comparison:
+def compare_moments(
+    agent: Agent,
+    offsets: Offsets,
+    starts: Sequence[Start],
+    *,
+    shadows: bool = True,
+    others: int = 8,
+) -> list[Comparison]:
     """Compares the moment at which an agent is to close the gripper, in both worlds.
 
     The agent acts greedily in the simulator. The moment is the first at which it closes the gripper
@@ -141,40 +149,52 @@ def compare_moment(
     Args:
       agent: that sees pixels by one camera.
       offsets: of the stand-in.
-      start: of the episode.
+      starts: of the episodes, one moment each.
       shadows: render the stand-in's shadows.
       others: number of other moments for the yardstick, spread over the episode.
 
     Raises:
-      ValueError: the agent sees no image, or several.
+      ValueError: the agent sees no image, or several, or there is no OpenGL.
     """
     if len(image_shape(agent)) != 3:
         raise ValueError("feature maps are compared for an agent with one camera")
-    qposes, images = _episode(agent, start)
+    play, outputs = _make_episode(agent), make_layer_outputs(agent)
     world = StandIn(agent.env, offsets, shadows=shadows)
-    moment = _moment(agent, world, qposes, images)
-    world.reset(qposes[moment], start.ctrl)
-    real = world.image
+    comparisons = []
+    for start in starts:
+        qposes, images, closes = play(start)
+        moment = _moment(world, qposes, closes)
+        world.reset(qposes[moment], start.ctrl)
+        rest = _spread(len(images), moment, others)
+        seen = np.stack([images[moment], world.image, *images[rest]])
+        layers = [_layer(name, x) for name, x in outputs(seen).items()]
+        q = np.asarray(agent.apply(agent.params, as_observations(agent, seen[:2])))
+        comparisons.append(Comparison(moment, seen[0], seen[1], q, layers))
     world.close()
-    rest = np.unique(np.linspace(0, len(images) - 1, others + 2).astype(int))
-    rest = rest[np.abs(rest - moment) > len(images) // (2 * others + 2)]
-    outputs = layer_outputs(agent, np.stack([images[moment], real, *images[rest]]))
-    layers = [
-        Layer(
-            name,
-            x[0],
-            x[1],
-            cosine(x[0], x[1]),
-            float(np.mean([cosine(x[0], other) for other in x[2:]])) if len(x) > 2 else 0.0,
-        )
-        for name, x in outputs.items()
-    ]
-    q = agent.apply(agent.params, as_observations(agent, np.stack([images[moment], real])))
-    return Comparison(moment, images[moment], real, np.asarray(q), layers)
+    return comparisons
 
 
-def _episode(agent: Agent, start: Start, iterations: int = 400) -> tuple[np.ndarray, np.ndarray]:
-    """States `[T, nq]` and images `[T, H, W, 3] uint8` of a greedy episode in the simulator."""
+def _layer(name: str, x: np.ndarray) -> Layer:
+    """A layer's outputs of the simulated image, the real one, and other moments."""
+    yardstick = float(np.mean([cosine(x[0], other) for other in x[2:]]))
+    return Layer(name, x[0], x[1], cosine(x[0], x[1]), yardstick)
+
+
+def _spread(length: int, moment: int, count: int) -> np.ndarray:
+    """Other moments, evenly spread over those that are not next to `moment`."""
+    apart = length // (2 * count + 2)
+    far = [i for i in range(length) if abs(i - moment) > apart] or [0]
+    return np.asarray(far)[np.linspace(0, len(far) - 1, count).astype(int)]
+
+
+def _make_episode(
+    agent: Agent, iterations: int = ITERATIONS
+) -> Callable[[Start], tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Makes a greedy episode in the simulator from a start.
+
+    It returns states `[T, nq]`, images `[T, H, W, 3] uint8`, and whether the agent closes the
+    gripper, `[T] bool`.
+    """
     env = agent.env
 
     def step(state: Any, _: None) -> tuple[Any, tuple[jax.Array, ...]]:
@@ -183,7 +203,7 @@ def _episode(agent: Agent, start: Start, iterations: int = 400) -> tuple[np.ndar
         after, transition = env.transition(state, action)
         ended = transition.terminated | transition.truncated
         image = rgb(obs) if env.config.observation == "packed" else obs
-        return after, (state.physics.qpos, image, ended)
+        return after, (state.physics.qpos, image, action == env.arm.close_action, ended)
 
     def run(qpos: jax.Array, ctrl: jax.Array) -> Any:
         _, state = env.reset(jax.random.key(0))
@@ -192,21 +212,24 @@ def _episode(agent: Agent, start: Start, iterations: int = 400) -> tuple[np.ndar
         return jax.lax.scan(step, state, None, length=iterations)[1]
 
     compiled = jax.jit(run, compiler_options=compiler_options(env.physics))
-    qpos, images, ended = jax.device_get(compiled(start.qpos, start.ctrl))
-    ends = np.flatnonzero(ended)
-    length = int(ends[0]) + 1 if len(ends) else iterations
-    return qpos[:length], images[:length]
+
+    def play(start: Start) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        *records, ended = jax.device_get(compiled(start.qpos, start.ctrl))
+        ends = np.flatnonzero(ended)
+        length = int(ends[0]) + 1 if len(ends) else iterations
+        qposes, images, closes = (x[:length] for x in records)
+        return qposes, images, closes
+
+    return play
 
 
-def _moment(agent: Agent, world: StandIn, qposes: np.ndarray, images: np.ndarray) -> int:
-    """See `compare_moment`."""
+def _moment(world: StandIn, qposes: np.ndarray, closes: np.ndarray) -> int:
+    """See `compare_moments`."""
     distances = []
     for qpos in qposes:
         world.data.qpos[:] = qpos
         world.update()
         distances.append(world.measure().distance)
-    q = np.asarray(jax.jit(agent.apply)(agent.params, as_observations(agent, images)))
-    closes = q.argmax(axis=-1) == agent.env.arm.close_action
     there = np.flatnonzero(closes & (np.asarray(distances) <= NEAR_CUBE))
     return int(there[0]) if len(there) else int(np.argmin(distances))
 
@@ -219,9 +242,10 @@ def draw_comparisons(comparisons: Sequence[tuple[str, Comparison]]) -> bytes:
     """
     import matplotlib.figure
 
-    rows = sum(1 + len(comparison.layers) for _, comparison in comparisons)
-    figure = matplotlib.figure.Figure(figsize=(11, 1.35 * rows + 0.4), layout="constrained")
-    grid = figure.subplots(rows, 2, squeeze=False)
+    heights = [x for _, found in comparisons for x in (1.2, *map(_height, found.layers))]
+    figure = matplotlib.figure.Figure(figsize=(11, sum(heights) + 0.6), layout="constrained")
+    rows = len(heights)
+    grid = figure.subplots(rows, 2, squeeze=False, gridspec_kw={"height_ratios": heights})
     row = 0
     for name, comparison in comparisons:
         _show(grid[row], comparison.simulated, comparison.real, f"{name}\nimage", colour=True)
@@ -229,8 +253,8 @@ def draw_comparisons(comparisons: Sequence[tuple[str, Comparison]]) -> bytes:
         for layer in comparison.layers:
             chosen = _strongest(layer.simulated)
             one, other = (_tiles(x[..., chosen]) for x in (layer.simulated, layer.real))
-            words = f"{layer.name.split('/')[-1]}\n{layer.similarity:.3f}\n({layer.yardstick:.3f})"
-            _show(grid[row], one, other, words)
+            figures = f"{layer.similarity:.3f} ({layer.yardstick:.3f})"
+            _show(grid[row], one, other, f"{layer.name.split('/')[-1]}\n{figures}")
             row += 1
     grid[0][0].set_title("simulator", fontsize=10)
     grid[0][1].set_title("stand-in for reality", fontsize=10)
@@ -248,10 +272,16 @@ def _show(axes: Any, one: np.ndarray, other: np.ndarray, words: str, colour: boo
     low, high = min(one.min(), other.min()), max(one.max(), other.max())
     options = {} if colour else {"cmap": "viridis", "vmin": low, "vmax": high}
     for axis, picture in zip(axes, (one, other), strict=True):
-        axis.imshow(picture, interpolation="nearest", **options)
+        aspect = "equal" if len(picture) > 1 else "auto"
+        axis.imshow(picture, interpolation="nearest", aspect=aspect, **options)
         axis.set_xticks([])
         axis.set_yticks([])
     axes[0].set_ylabel(words, fontsize=8, rotation=0, ha="right", va="center")
+
+
+def _height(layer: Layer) -> float:
+    """Height of a layer's row, inches."""
+    return 1.2 if layer.simulated.ndim == 3 else 0.35
 
 
 def _strongest(x: np.ndarray) -> np.ndarray:
@@ -262,11 +292,9 @@ def _strongest(x: np.ndarray) -> np.ndarray:
 
 
 def _tiles(x: np.ndarray) -> np.ndarray:
-    """Maps `[H, W, C]` side by side in two rows, or a vector in two rows."""
+    """Maps `[H, W, C]` side by side in two rows, or a vector in one."""
     if x.ndim != 3:
-        flat = x.ravel()
-        half = -(-len(flat) // 2)
-        return np.pad(flat, (0, 2 * half - len(flat))).reshape(2, half)
+        return x.reshape(1, -1)
     maps = np.pad(np.moveaxis(x, -1, 0), ((0, 0), (0, 1), (0, 1)))
     half = -(-len(maps) // 2)
     maps = np.concatenate([maps, np.zeros((2 * half - len(maps), *maps.shape[1:]))])

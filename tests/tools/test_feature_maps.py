@@ -9,10 +9,11 @@ from PIL import Image
 
 from mjx_arm.standin.levels import Offsets, find_level
 from mjx_arm.tools.feature_maps import (
-    compare_moment,
+    as_observations,
+    compare_moments,
     cosine,
     draw_comparisons,
-    layer_outputs,
+    make_layer_outputs,
     to_json,
 )
 from mjx_arm.tools.transfer import sample_starts
@@ -30,7 +31,7 @@ def test_the_outputs_are_those_of_the_network() -> None:
     """The first convolution by jax's own convolution, and the last layer's size."""
     agent = load_agent("agent-a")
     images = np.random.default_rng(0).integers(0, 256, (2, *agent.env.config.size, 3), np.uint8)
-    outputs = layer_outputs(agent, images)
+    outputs = make_layer_outputs(agent)(images)
     network = agent.config.network
     kernel = agent.params["params"]["PatchConv_0"]["kernel"]
     strides = (network.strides[0],) * 2
@@ -43,25 +44,25 @@ def test_the_outputs_are_those_of_the_network() -> None:
     x = x.reshape(n, h // pool, pool, w // pool, pool, c).max(axis=(2, 4))
     x = np.maximum(x + agent.params["params"]["PatchConv_0"]["bias"], 0)
     assert outputs["PatchConv_0"] == pytest.approx(x, abs=1e-4)
-    assert [name for name in outputs if name.startswith("PatchConv")] == [
-        "PatchConv_0",
-        "PatchConv_1",
-        "PatchConv_2",
-    ]
+    assert list(outputs)[:3] == ["PatchConv_0", "PatchConv_1", "PatchConv_2"]
+    q = np.asarray(agent.apply(agent.params, as_observations(agent, images)))
+    advantages = q - q.mean(axis=-1, keepdims=True)
+    assert list(outputs)[-1] == "Q-values"
+    assert outputs["Q-values"] == pytest.approx(advantages, abs=1e-4)
 
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("opengl")
 def test_a_moment_in_both_worlds() -> None:
     agent = load_agent("agent-a")
-    start = sample_starts(agent.env, 3, 1)[0]
-    same = compare_moment(agent, Offsets(), start, shadows=False)
-    other = compare_moment(agent, find_level("test"), start)
+    starts = sample_starts(agent.env, 3, 1)
+    (same,) = compare_moments(agent, Offsets(), starts, shadows=False)
+    (other,) = compare_moments(agent, find_level("test"), starts)
     assert same.moment == other.moment
     assert np.abs(same.simulated.astype(int) - same.real).mean() < 3
     for one, two in zip(same.layers, other.layers, strict=True):
         assert one.name == two.name
-        assert 0.9 < one.similarity <= 1 + 1e-9
+        assert 0.7 < one.similarity <= 1 + 1e-9
         assert two.similarity < one.similarity
         assert np.array_equal(one.simulated, two.simulated)
     report = to_json(other)
