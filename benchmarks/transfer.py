@@ -118,13 +118,11 @@ def main() -> None:
         true_levels = [level for level in options.levels if level != "test"]
         if true_levels:
             counts = {"home": options.episodes, "in_grasp": options.in_grasp_episodes}
-            note_reading(
-                options.out,
-                name,
-                agent,
-                levels=true_levels,
-                episodes={start: counts[start] for start in options.starts},
-            )
+            episodes = {start: counts[start] for start in options.starts}
+            try:
+                note_reading(options.out, name, agent, levels=true_levels, episodes=episodes)
+            except ValueError as error:
+                parser.error(str(error))
         for world in ("simulation", *options.levels):
             for start in options.starts:
                 began = time.monotonic()

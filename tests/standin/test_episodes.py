@@ -7,7 +7,7 @@ import pytest
 
 from mjx_arm.export import export_policy
 from mjx_arm.standin.episodes import Job, Runner, run_episodes
-from mjx_arm.standin.levels import find_level
+from mjx_arm.standin.levels import Offsets, find_level
 from mjx_arm.tools.transfer import sample_starts
 from mjx_arm.training.agent import load_agent
 
@@ -29,6 +29,7 @@ def same(one, other) -> bool:
     return all(np.array_equal(x, y) for x, y in pairs)
 
 
+@pytest.mark.slow
 def test_an_episode_depends_on_its_number_and_start_alone(agent, job) -> None:
     starts = sample_starts(agent.env, 1, 2)
     runner = Runner(job)
@@ -55,3 +56,11 @@ def test_a_process_that_cannot_start_says_why(agent, job) -> None:
     broken = dataclasses.replace(job, policy=b"no policy")
     with pytest.raises(ValueError, match="the policy is no exported policy"):
         run_episodes(broken, sample_starts(agent.env, 1, 2), processes=2)
+
+
+@pytest.mark.slow
+def test_without_offsets_an_agent_succeeds_as_in_its_simulator(agent) -> None:
+    """Nothing but the renderer is another one."""
+    job = Job(agent.env, Offsets(), export_policy(agent), 400, 0.1, seed=3, shadows=False)
+    traces = run_episodes(job, sample_starts(agent.env, 4, 6), processes=0)
+    assert sum(trace.success for trace in traces) >= 4
