@@ -7,6 +7,7 @@ closed the gripper; with the cube in its grasp from the start it lifted it.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import pathlib
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
@@ -123,10 +124,19 @@ def sample_starts(env: Env, seed: int, episodes: int) -> list[Start]:
       episodes: how many.
     """
     start_key, _ = jax.random.split(role_key(seed, EVALUATION))
-    keys = jax.random.split(start_key, episodes)
-    states = jax.jit(jax.vmap(lambda key: env.reset(key)[1]))(keys)
-    qpos, ctrl = jax.device_get((states.physics.qpos, states.ctrl))
+    qpos, ctrl = jax.device_get(_starter(env)(jax.random.split(start_key, episodes)))
     return [Start(*each) for each in zip(qpos, ctrl, strict=True)]
+
+
+@functools.lru_cache(maxsize=4)
+def _starter(env: Env) -> Callable[[jax.Array], tuple[jax.Array, jax.Array]]:
+    """`keys [N] -> qpos [N, nq], ctrl [N, nu]` of starts, compiled once for an environment."""
+
+    def start(key: jax.Array) -> tuple[jax.Array, jax.Array]:
+        _, state = env.reset(key)
+        return state.physics.qpos, state.ctrl
+
+    return jax.jit(jax.vmap(start))
 
 
 def in_standin(
