@@ -37,24 +37,29 @@ MOST_ACTIONS = 400
 
 
 def measure(
-    agent: Agent, rate: float, seconds: float, level: str, folder: pathlib.Path
+    agent: Agent, rate: float, options: argparse.Namespace, folder: pathlib.Path
 ) -> dict[str, Any]:
     """One rate, for a time; logs go to a folder, since writing them is part of the loop."""
     policy = Policy(export_policy(agent))
     guard = make_guard(agent.env.scene, agent.env.arm)
     starts = sample_starts(agent.env, SEED, STARTS)
     outcomes, successes, complete = [], 0, 0
+    faults: list[str] = []
     with (
-        StandInProcess(agent.env, find_level(level), starts) as process,
+        StandInProcess(agent.env, find_level(options.level), starts) as process,
         StandInRobot(process.port) as robot,
     ):
-        ends = time.monotonic() + seconds
+        ends = time.monotonic() + options.seconds
         while time.monotonic() < ends:
             left = ends - time.monotonic()
             number = len(outcomes)
             robot.reset(number % STARTS)
             config = LoopConfig(
-                rate=rate, seconds=min(left, MOST_ACTIONS / rate), epsilon=0.1, seed=SEED + number
+                rate=rate,
+                seconds=min(left, MOST_ACTIONS / rate),
+                epsilon=0.1,
+                watchdog=options.watchdog,
+                seed=SEED + number,
             )
             path = folder / f"deploy-{rate:g}-{number}.jsonl"
             with Log(path, {"rate": rate}) as lines:
@@ -67,7 +72,7 @@ def measure(
                     until=lambda: bool(robot.measured("success")),
                 )
             if outcome.ending == "fault":
-                raise SystemExit(outcome.reason)
+                faults.append(outcome.reason)
             outcomes.append(outcome)
             succeeded = outcome.reason == "the task is done"
             successes += succeeded
@@ -79,11 +84,13 @@ def measure(
     ticks, misses = sum(x.ticks for x in outcomes), sum(x.misses for x in outcomes)
     return {
         "rate": rate,
-        "seconds": seconds,
-        "level": level,
+        "seconds": options.seconds,
+        "level": options.level,
         "ticks": ticks,
         "misses": misses,
         "missed_share": misses / ticks,
+        "faults": faults,
+        "watchdog": options.watchdog,
         "refused": sum(x.refused for x in outcomes),
         "inference_ms": {
             "median": float(np.median(inference)),
@@ -109,6 +116,7 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=600.0)
     parser.add_argument("--level", choices=tuple(LEVELS), default="test")
     parser.add_argument("--scene", help="by default the one that the agent was trained in")
+    parser.add_argument("--watchdog", type=float, default=0.3, help="oldest image, s")
     parser.add_argument("--logs", type=pathlib.Path, help="folder to keep the logs in")
     parser.add_argument("--json", type=pathlib.Path, help="file to write the results to")
     options = parser.parse_args()
@@ -117,7 +125,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as temporary:
         folder = options.logs or pathlib.Path(temporary)
         for rate in options.rates:
-            rows.append(measure(agent, rate, options.seconds, options.level, folder))
+            rows.append(measure(agent, rate, options, folder))
             print(json.dumps(rows[-1]), flush=True)
     if options.json:
         report = {"machine": machine(), "agent": options.agent, "rows": rows}

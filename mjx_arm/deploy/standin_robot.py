@@ -138,10 +138,12 @@ class StandInRobot:
             episode = self._state.get("episode", 0)
         self._command(kind="reset", start=start)
         with self._lock:
-            self._lock.wait_for(
+            seen = self._lock.wait_for(
                 lambda: self._error or self._state.get("episode", 0) > episode, _PATIENCE
             )
             self._check()
+            if not seen:
+                raise RobotError("the stand-in does not go to another start")
 
     def _command(self, **values: Any) -> None:
         with self._lock:
