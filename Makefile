@@ -21,8 +21,8 @@ STAMP := $(VENV)/.locked-$(LOCK)
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 SUPPORTED := import sys; sys.exit(sys.version_info[:2] not in {(3, 11), (3, 12), (3, 13)})
 
-.PHONY: help setup train play test test-slow test-long test-campaign peers test-peers docs format lock lock-peers \
-  lock-docs clean
+.PHONY: help setup train play test test-slow test-long test-campaign peers test-peers onnx test-onnx docs format \
+  lock lock-peers lock-onnx lock-docs clean
 
 help:
 	@echo "make setup      build $(VENV) from the lock; GPU=cuda12 or GPU=cuda13 for NVIDIA"
@@ -34,6 +34,8 @@ help:
 	@echo "make test-campaign  tries to break runs and files, two hours; ARGS=\"--parts kills\" for a part"
 	@echo "make peers      build $(PEERS) with what we are measured against"
 	@echo "make test-peers the tests of the adapters, with trainers of others"
+	@echo "make onnx       build $(ONNX), whose mjx-arm export has --format onnx"
+	@echo "make test-onnx  the test of ONNX, there"
 	@echo "make docs       build the documentation, with its notebooks, and check its links"
 	@echo "make format     let ruff rewrite the sources"
 	@echo "make lock       resolve the lock again; ARGS=--upgrade for the newest versions"
@@ -98,6 +100,23 @@ PEERS_TESTS := tests/interop tests/docs/test_snippets.py
 test-peers: $(PEERS)/.locked
 	$(PEERS)/bin/python -m pytest -m peers $(PEERS_TESTS)
 
+# jax2onnx excludes the orbax-checkpoint that training needs, so ONNX has an environment of its own.
+ONNX := .venv-onnx
+
+onnx: $(ONNX)/.locked
+	@echo "$(ONNX) is ready: $(ONNX)/bin/mjx-arm export AGENT --format onnx --out FILE"
+
+$(ONNX)/.locked: requirements/onnx.txt
+	@$(PYTHON) -m venv --clear $(ONNX)
+	@$(ONNX)/bin/python -m pip install --quiet --disable-pip-version-check \
+	  --require-hashes --only-binary :all: -r $<
+	@$(ONNX)/bin/python -m pip install --quiet --disable-pip-version-check \
+	  --no-build-isolation --no-deps --editable .
+	@touch $@
+
+test-onnx: $(ONNX)/.locked
+	$(ONNX)/bin/python -m pytest -m onnx tests/test_onnx.py
+
 # The documentation is built in an environment of its own, with the versions of the CPU's lock.
 DOCS := .venv-docs
 SITE := docs/_build/html
@@ -132,6 +151,13 @@ lock-peers: .venv-lock/bin/uv-$(UV_VERSION)
 	  --generate-hashes --no-emit-index-url --no-emit-find-links --find-links "$(PIP_FIND_LINKS)" \
 	  --constraints .venv-lock/constraints.txt --extra peers $(ARGS) --output-file requirements/peers.txt
 	@sed -i 's/^torch==\([0-9.]*\)+cpu/torch==\1/' requirements/peers.txt
+
+# The override is what makes jax2onnx and mjx_arm fit: an export reads no checkpoint.
+lock-onnx: .venv-lock/bin/uv-$(UV_VERSION)
+	@echo "orbax-checkpoint<0.11.37" > .venv-lock/overrides.txt
+	@UV_CUSTOM_COMPILE_COMMAND="make lock-onnx" .venv-lock/bin/uv pip compile pyproject.toml requirements/onnx.in \
+	  --no-config --quiet --universal --python-version 3.11 --generate-hashes --no-emit-index-url \
+	  --override .venv-lock/overrides.txt $(ARGS) --output-file requirements/onnx.txt
 
 # The same versions as in the CPU's lock, so that the notebooks run what the tests run.
 lock-docs: .venv-lock/bin/uv-$(UV_VERSION)

@@ -11,10 +11,11 @@ import os
 import pathlib
 import signal
 import sys
+import time
 import typing
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from types import FrameType
-from typing import Annotated, Any, NoReturn, TypeVar
+from typing import Annotated, Any, Literal, NoReturn, TypeVar
 
 import jax
 import tyro
@@ -23,20 +24,42 @@ from rich.console import Console
 from mjx_arm.algos.exploration import check_epsilon
 from mjx_arm.arguments import read_arguments
 from mjx_arm.config import TrainConfig, set_train_options
+from mjx_arm.deploy.camera import VideoCamera
+from mjx_arm.deploy.dynamixel import DynamixelConfig, DynamixelRobot, read_config
+from mjx_arm.deploy.guard import make_guard
+from mjx_arm.deploy.log import Log, replay
+from mjx_arm.deploy.loop import LoopConfig, describe_outcome, run_loop, stop_on_signals
+from mjx_arm.deploy.robot import Robot
+from mjx_arm.deploy.standin_robot import StandInRobot
+from mjx_arm.deploy.standin_server import StandInProcess
 from mjx_arm.devices import check_device
-from mjx_arm.options import check_name, flat_annotations, flat_names, get_option
+from mjx_arm.export import check_path, export_policy, image_shape, write_policy
+from mjx_arm.options import (
+    Count,
+    Positive,
+    check_name,
+    check_value,
+    flat_annotations,
+    flat_names,
+    get_option,
+)
+from mjx_arm.policy import Policy
 from mjx_arm.presets import PRESETS
 from mjx_arm.report.figures import plot_curves
 from mjx_arm.report.progress import make_console
 from mjx_arm.report.run_page import write_report
 from mjx_arm.report.video import check_video_path, draw_episode, record_episode, write_video
 from mjx_arm.reproduce.command import reproduce
+from mjx_arm.standin.episodes import Trace
+from mjx_arm.standin.levels import find_level
+from mjx_arm.standin.world import check_env
 from mjx_arm.tools.compare import describe, read_result, to_json, write_comparison
 from mjx_arm.tools.search_space import parse_space
 from mjx_arm.tools.sweep import describe_sweep, sweep
+from mjx_arm.tools.transfer import ITERATIONS, in_standin, sample_starts, summarise
 from mjx_arm.tools.wandb_log import WandbLog, import_wandb
 from mjx_arm.tools.zoo import describe_zoo, read_shipped, read_zoo
-from mjx_arm.training.agent import Agent, differences, load_agent
+from mjx_arm.training.agent import STORED, Agent, differences, load_agent
 from mjx_arm.training.evaluate import evaluate
 from mjx_arm.training.loop import EVALUATION, role_key
 from mjx_arm.training.mesh import make_mesh
@@ -208,6 +231,16 @@ class Sweep:
         print(self.out / "sweep.html")
 
 
+def check_seed(seed: int) -> None:
+    """Refuses what is no seed.
+
+    Raises:
+      ValueError: it is not from 0 to 2**31 - 1.
+    """
+    if not 0 <= seed < 2**31:
+        raise ValueError(f"seed must be from 0 to {2**31 - 1}, got {seed}")
+
+
 @dataclasses.dataclass(frozen=True)
 class _Try:
     """What the commands that try an agent have in common.
@@ -234,8 +267,7 @@ class _Try:
     def load(self) -> Agent:
         check_device()
         check_epsilon(self.epsilon)
-        if not 0 <= self.seed < 2**31:
-            raise ValueError(f"seed must be from 0 to {2**31 - 1}, got {self.seed}")
+        check_seed(self.seed)
         options = {"env": self.env, "physics": self.physics}
         given = {name: value for name, value in options.items() if value is not None}
         return load_agent(self.agent, max_steps=self.max_steps, scene=self.scene, **given)
@@ -433,7 +465,251 @@ class Reproduce:
         )
 
 
-Command = Train | Eval | Play | Figures | Compare | Agents | View | Sweep | Reproduce
+@dataclasses.dataclass(frozen=True)
+class _Real:
+    """What the commands that try an agent in the stand-in for reality have in common.
+
+    Attributes:
+      agent: an agent's file, or a run folder, of which the best agent is taken.
+      level: how far the stand-in is from the simulator: `near`, `medium`, `far`, or `test`.
+      env: environment, `A` or `B`; by default the one it was trained in.
+      start: `home`, or `in_grasp` with the cube in the closed gripper.
+      epsilon: share of random actions.
+      seed: of starts and random actions.
+      scene: name or path of a scene, or `stored` for the one in the agent's file; by default the
+        one that it was trained in, as long as that has not changed.
+    """
+
+    agent: tyro.conf.Positional[pathlib.Path]
+    level: str = "near"
+    env: str | None = None
+    start: str = "home"
+    epsilon: float = 0.1
+    seed: int = 7
+    scene: str | None = None
+
+    def load(self, max_steps: int = 1_000) -> Agent:
+        check_device()
+        check_epsilon(self.epsilon)
+        check_seed(self.seed)
+        find_level(self.level)
+        given = {} if self.env is None else {"env": self.env}
+        if self.start != "home":
+            given["start"] = self.start
+        agent = load_agent(self.agent, max_steps=max_steps, scene=self.scene, **given)
+        check_env(agent.env)
+        return agent
+
+
+@dataclasses.dataclass(frozen=True)
+class Transfer(_Real):
+    """Try an agent in the stand-in for reality, and say how far it came.
+
+    The stand-in is MuJoCo's C physics and MuJoCo's own OpenGL renderer, with fixed offsets by
+    level: camera, colours, friction, masses, servo gain, delay. Processes share the episodes.
+
+    Attributes:
+      episodes: number of episodes.
+      max_steps: iterations until an episode ends.
+      shadows: render shadows of the lights that cast them.
+      out: a video of the first episode, ending in `.mp4` or `.gif`.
+      json: print one JSON object.
+    """
+
+    episodes: int = 100
+    max_steps: int = ITERATIONS
+    shadows: bool = True
+    out: pathlib.Path | None = None
+    json: bool = False
+
+    def run(self, given: frozenset[str]) -> None:
+        """Runs the command."""
+        del given
+        check_value("episodes", Count, self.episodes)
+        if self.out is not None:
+            check_video_path(self.out)
+        agent = self.load(self.max_steps)
+        done: list[bool] = []
+
+        def on_episode(trace: Trace) -> None:
+            done.append(trace.success)
+            if len(done) % 10 == 0 or len(done) == self.episodes:
+                found = f"{sum(done)} successes in {len(done)} of {self.episodes} episodes"
+                print(found, file=sys.stderr, flush=True)
+
+        began = time.monotonic()
+        traces = in_standin(
+            agent,
+            find_level(self.level),
+            sample_starts(agent.env, self.seed, self.episodes),
+            epsilon=self.epsilon,
+            iterations=self.max_steps,
+            seed=self.seed,
+            shadows=self.shadows,
+            video=self.out,
+            on_episode=on_episode,
+        )
+        report = {
+            "agent": str(self.agent),
+            "level": self.level,
+            "env": agent.env.config.env,
+            "scene": agent.env.config.scene_name,
+            "start": self.start,
+            "epsilon": self.epsilon,
+            "seed": self.seed,
+            "shadows": self.shadows,
+            **dataclasses.asdict(summarise(traces, agent.env)),
+            "seconds": round(time.monotonic() - began, 1),
+        }
+        if self.json:
+            print(json.dumps(report))
+            return
+        for name, value in report.items():
+            print(f"{name:<22} {value}")
+
+
+@dataclasses.dataclass(frozen=True)
+class Deploy(_Real):
+    """Drive a robot by an agent, at a fixed rate, and log it.
+
+    The robot is the stand-in, in a process of its own, or an arm of Dynamixel servos. Ctrl-C stops
+    the arm.
+
+    Attributes:
+      robot: `standin` or `dynamixel`.
+      rate: actions a second, 25 or 50. Training has 50.
+      seconds: how long it runs at most.
+      dry_run: look and think, and send nothing to the robot.
+      watchdog: stop where the newest image is older than this, s.
+      workspace: x y z of the lower corner of the box that the gripper stays in, then of the upper
+        one, m.
+      arm: a JSON file that describes the arm of Dynamixel servos.
+      port: of a stand-in that runs already; by default one is started.
+      log: file for the log; by default `deploy-` and the time.
+      replay: a log to replay instead: its images are given to the agent again.
+      json: print one JSON object.
+    """
+
+    robot: Literal["standin", "dynamixel"] = "standin"
+    rate: Literal[25, 50] = 25
+    seconds: Positive = 60.0
+    dry_run: bool = False
+    watchdog: Positive = 0.3
+    workspace: tuple[float, float, float, float, float, float] | None = None
+    arm: pathlib.Path | None = None
+    port: int | None = None
+    log: pathlib.Path | None = None
+    replay: pathlib.Path | None = None
+    json: bool = False
+
+    def run(self, given: frozenset[str]) -> int:
+        """Runs the command; the exit status is 2 after a fault, and 130 after Ctrl-C."""
+        del given
+        if self.robot == "dynamixel" and self.arm is None:
+            raise ValueError("--robot dynamixel needs --arm FILE, which describes the arm")
+        arm = None if self.arm is None else read_config(self.arm)
+        agent = self.load()
+        policy = Policy(export_policy(agent))
+        if self.replay is not None:
+            self._print(dataclasses.asdict(replay(self.replay, policy)))
+            return 0
+        config = LoopConfig(
+            rate=float(self.rate),
+            seconds=self.seconds,
+            epsilon=self.epsilon,
+            degrees=agent.env.config.degrees_per_action,
+            watchdog=self.watchdog,
+            dry_run=self.dry_run,
+            seed=self.seed,
+        )
+        guard = make_guard(agent.env.scene, agent.env.arm, self.workspace)
+        path = self.log or pathlib.Path(f"deploy-{time.strftime('%Y%m%d-%H%M%S')}.jsonl")
+        header: dict[str, Any] = {"agent": str(self.agent), "robot": self.robot}
+        header |= {
+            "level": self.level,
+            "options": dataclasses.asdict(config),
+            "limits": guard.limits.tolist(),
+        }
+        with (
+            stop_on_signals() as stop,
+            self._connect(agent, arm) as (robot, until),
+            Log(path, {**header, "workspace": guard.box.tolist()}) as log,
+        ):
+            outcome = run_loop(robot, policy, guard, config, log, stop=stop, until=until)
+        self._print({"log": str(path), **describe_outcome(outcome)})
+        if outcome.ending == "fault":
+            print(f"error: {outcome.reason}", file=sys.stderr)
+        return {"done": 0, "stopped": 130, "fault": 2}[outcome.ending]
+
+    @contextlib.contextmanager
+    def _connect(
+        self, agent: Agent, arm: DynamixelConfig | None
+    ) -> Iterator[tuple[Robot, Callable[[], bool] | None]]:
+        """The robot, and what says that the task is done, if anything does."""
+        with contextlib.ExitStack() as stack:
+            if self.robot == "dynamixel":
+                assert arm is not None
+                camera = VideoCamera(arm.camera, agent.env.config.size)
+                stack.callback(camera.close)
+                yield stack.enter_context(DynamixelRobot(arm, camera.frame)), None
+                return
+            port = self.port
+            if port is None:
+                starts = sample_starts(agent.env, self.seed, 1)
+                process = StandInProcess(agent.env, find_level(self.level), starts)
+                port = stack.enter_context(process).port
+            robot = stack.enter_context(StandInRobot(port))
+            yield robot, lambda: bool(robot.measured("success"))
+
+    def _print(self, report: dict[str, Any]) -> None:
+        if self.json:
+            print(json.dumps(report))
+            return
+        for name, value in report.items():
+            print(f"{name:<22} {value}")
+
+
+@dataclasses.dataclass(frozen=True)
+class Export:
+    """Write the policy of an agent for other programs: image in, Q-values and action out.
+
+    Attributes:
+      agent: an agent's file, or a run folder, of which the best agent is taken.
+      format: `stablehlo`, which runs wherever jax and flatbuffers are, or `onnx`, which needs the
+        environment that `make onnx` builds.
+      out: the file.
+    """
+
+    agent: tyro.conf.Positional[pathlib.Path]
+    format: Literal["stablehlo", "onnx"] = "stablehlo"
+    out: pathlib.Path = pathlib.Path("policy.bin")
+
+    def run(self, given: frozenset[str]) -> None:
+        """Runs the command."""
+        del given
+        check_device()
+        check_path(self.out)
+        # ONNX has convolutions; ours are matrix products over patches on a CPU.
+        options: dict[str, Any] = {"convolution": "nn.Conv"} if self.format == "onnx" else {}
+        agent = load_agent(self.agent, scene=STORED, **options)
+        write_policy(agent, self.out, self.format)
+        print(f"{self.out}: image {list(image_shape(agent))}, {agent.env.num_actions} actions")
+
+
+Command = (
+    Train
+    | Eval
+    | Play
+    | Figures
+    | Compare
+    | Agents
+    | View
+    | Sweep
+    | Reproduce
+    | Transfer
+    | Deploy
+    | Export
+)
 _COMMANDS: dict[str, type[Command]] = {
     "train": Train,
     "eval": Eval,
@@ -444,6 +720,9 @@ _COMMANDS: dict[str, type[Command]] = {
     "view": View,
     "sweep": Sweep,
     "reproduce": Reproduce,
+    "transfer": Transfer,
+    "deploy": Deploy,
+    "export": Export,
 }
 _SUBJECTS = {
     "agent": "an agent's file or a run folder",
@@ -573,7 +852,20 @@ def _help(arguments: Sequence[str]) -> NoReturn:
     """Prints the help, which shows the values of the preset, and the options of the task."""
     train_ = Annotated[Train, tyro.conf.subcommand("train", default=_help_of(Train, arguments))]
     sweep_ = Annotated[Sweep, tyro.conf.subcommand("sweep", default=_help_of(Sweep, arguments))]
-    commands: Any = train_ | Eval | Play | Figures | Compare | Agents | View | sweep_ | Reproduce
+    commands: Any = (
+        train_
+        | Eval
+        | Play
+        | Figures
+        | Compare
+        | Agents
+        | View
+        | sweep_
+        | Reproduce
+        | Transfer
+        | Deploy
+        | Export
+    )
     first = [name for name in arguments[:1] if name in _COMMANDS]
     tyro.cli(
         commands,
@@ -592,15 +884,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the command line.
 
     Returns:
-      The exit status: 2 for invalid input or a disk that does not take the output, 130 for a run
-      that was interrupted.
+      The exit status: 2 for invalid input, a disk that does not take the output or a robot that has
+      failed, 130 for a run that was interrupted.
     """
     arguments = sys.argv[1:] if arguments is None else arguments
     try:
         command, given = _parse(arguments)
         # Whatever JAX_NUMPY_RANK_PROMOTION says: it is meant for the user's own programs.
         with jax.numpy_rank_promotion("allow"):
-            command.run(given)
+            return command.run(given) or 0
     except ValueError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
@@ -617,11 +909,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         else:
             print(f"error: {lost_sentence(error)}", file=sys.stderr)
         return 2
+    except KeyboardInterrupt:
+        return 130
     except RunInterruptedError as stop:
         if is_writer():
             print(stop, file=sys.stderr)
         return 130
-    return 0
 
 
 def run(arguments: Sequence[str] | None = None) -> NoReturn:

@@ -23,9 +23,27 @@ if _CACHE not in os.environ:
     atexit.register(shutil.rmtree, os.environ[_CACHE], ignore_errors=True)
 
 import jax  # noqa: E402
+import pytest  # noqa: E402
 
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_compilation_cache_dir", os.environ[_CACHE])
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
 # A limit in bytes makes jax lock the folder: no worker reads what another one is still writing.
 jax.config.update("jax_compilation_cache_max_size", 2**33)
+
+
+@pytest.fixture(scope="session")
+def opengl() -> None:
+    """Skips where MuJoCo finds no OpenGL, unless MJX_ARM_REQUIRE_GL=1 asks to fail instead."""
+    import mujoco
+
+    try:
+        mujoco.Renderer(mujoco.MjModel.from_xml_string("<mujoco/>"), 8, 8).close()
+    except Exception as error:
+        reason = (
+            f"no OpenGL ({type(error).__name__}: {error}): install the system package libegl1 "
+            "or libosmesa6, or set MUJOCO_GL"
+        )
+        if os.environ.get("MJX_ARM_REQUIRE_GL") == "1":
+            pytest.fail(reason)
+        pytest.skip(reason)

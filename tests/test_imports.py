@@ -33,12 +33,23 @@ FORBIDDEN = {
     "report": ("presets", "networks", "training", "interop", "cli"),
     "interop": ("config", "presets", "networks", "algos", "training", "report", "cli"),
     "training": ("interop", "cli", "presets"),
-    "tools": ("interop", "cli", "presets", "view", "reproduce"),
+    "standin": (
+        *("config", "presets", "networks", "algos", "training", "report", "interop"),
+        *("cli", "export", "deploy"),
+    ),
+    "export": ("presets", "algos", "report", "interop", "cli", "standin", "deploy"),
+    "deploy": (
+        *("config", "presets", "networks", "algos", "training", "report", "interop"),
+        *("cli", "export"),
+    ),
+    "tools": ("interop", "cli", "presets", "view", "deploy", "reproduce"),
     "view": ("interop", "cli", "presets", "tools", "reproduce"),
-    "reproduce": ("interop", "cli", "view"),
+    "reproduce": ("interop", "cli", "view", "deploy", "standin"),
 }
 # Only the command line imports these.
 OUTERMOST = ("tools", "view", "reproduce")
+# No part of the training touches the stand-in for reality.
+MAY_IMPORT_STANDIN = ("standin", "deploy", "tools", "cli")
 
 
 def modules(part: str) -> list[pathlib.Path]:
@@ -88,9 +99,17 @@ def test_only_the_command_line_imports_the_tools():
             assert not parts_of(imported(path)) & set(OUTERMOST), path
 
 
+def test_nothing_that_trains_imports_the_stand_in():
+    for path in sorted(PACKAGE.rglob("*.py")):
+        part = path.relative_to(PACKAGE).parts[0].removesuffix(".py")
+        if part not in MAY_IMPORT_STANDIN:
+            assert "standin" not in parts_of(imported(path)), path
+
+
 def test_every_part_of_the_package_is_in_the_table():
     outer = {"__init__", "__main__", "arguments", "cli", "presets"}
-    helpers = {"cores", "devices", "digest", "microbatch", "references", "shard", "silence"}
+    helpers = {"cores", "devices", "digest", "microbatch", "policy", "references"}
+    helpers |= {"shard", "silence"}
     names = {path.stem for path in PACKAGE.iterdir() if path.suffix == ".py" or path.is_dir()}
     found = {name for name in names if modules(name)}
     assert found - {"xml", "__pycache__"} == set(FORBIDDEN) | outer | helpers

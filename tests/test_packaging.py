@@ -50,7 +50,7 @@ def versions(lock: str, python: str, platform: dict[str, str]) -> dict[str, str]
     return found
 
 
-@pytest.mark.parametrize("lock", [*LOCKS, "docs", "peers"])
+@pytest.mark.parametrize("lock", [*LOCKS, "docs", "onnx", "peers"])
 def test_lock_pins_and_hashes_everything(lock: str) -> None:
     locked = pins(lock)
     assert locked
@@ -62,7 +62,7 @@ def test_lock_pins_and_hashes_everything(lock: str) -> None:
         assert all(re.fullmatch(r"sha256:[0-9a-f]{64}", each) for each in hashes), requirement
 
 
-@pytest.mark.parametrize("lock", [*LOCKS, "docs", "peers"])
+@pytest.mark.parametrize("lock", [*LOCKS, "docs", "onnx", "peers"])
 def test_lock_names_no_place(lock: str) -> None:
     """No index, host or path: the lock means the same on every machine."""
     text = (ROOT / "requirements" / f"{lock}.txt").read_text()

@@ -48,7 +48,9 @@ class PatchConv(nn.Module):
                 x, kernel, strides, "SAME", dimension_numbers=dimensions
             )
             window = (self.pool, self.pool)
-            return (nn.max_pool(x, window, window) if self.pool > 1 else x) + bias
+            # By keywords: jax2onnx knows no other call.
+            pooled = nn.max_pool(x, window_shape=window, strides=window) if self.pool > 1 else x
+            return pooled + bias
         # The bias after the pooling: the same values with less to add.
         return max_pool(convolve(x, kernel, self.stride), self.pool) + bias
 
