@@ -25,7 +25,7 @@ def test_agents_lists_them(capsys):
     assert lines[0].split() == ["name", "task", "env", "sees", "trained", "by", "steps", "success"]
     (line,) = [line for line in lines if line.startswith("agent-b ")]
     assert "64×64 pixels of front" in line
-    assert "1,441,792" in line
+    assert "2,490,368" in line
 
 
 def test_agents_prints_json(capsys):
@@ -38,7 +38,7 @@ def test_agents_prints_json(capsys):
 
 def test_agents_shows_a_card(capsys):
     assert main(["agents", "agent-b"]) == 0
-    assert "949 of 1,000 held-out episodes" in capsys.readouterr().out
+    assert "987 of 1,000 held-out episodes" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
