@@ -24,7 +24,8 @@ from mjx_arm.algos.exploration import check_epsilon
 from mjx_arm.arguments import read_arguments
 from mjx_arm.config import TrainConfig, set_train_options
 from mjx_arm.devices import check_device
-from mjx_arm.options import check_name, flat_annotations, flat_names, get_option
+from mjx_arm.envs.randomisation import RandomisationConfig
+from mjx_arm.options import check_name, flat_annotations, flat_names, get_option, option_names
 from mjx_arm.presets import PRESETS
 from mjx_arm.report.figures import plot_curves
 from mjx_arm.report.progress import make_console
@@ -220,6 +221,8 @@ class _Try:
       max_steps: iterations until an episode is truncated.
       scene: name or path of a scene to try it in, or `stored` for the one in the agent's file; by
         default the one that it was trained in, as long as that has not changed.
+      randomisation: domain randomisation by one preset, `off`, `tight` or `standard`; by default
+        what it was trained with.
     """
 
     agent: tyro.conf.Positional[pathlib.Path]
@@ -229,6 +232,7 @@ class _Try:
     seed: int = 7
     max_steps: int = 1_000
     scene: str | None = None
+    randomisation: str | None = None
 
     def load(self) -> Agent:
         check_device()
@@ -236,7 +240,11 @@ class _Try:
         if not 0 <= self.seed < 2**31:
             raise ValueError(f"seed must be from 0 to {2**31 - 1}, got {self.seed}")
         options = {"env": self.env, "physics": self.physics}
-        given = {name: value for name, value in options.items() if value is not None}
+        given: dict[str, Any] = {name: x for name, x in options.items() if x is not None}
+        if self.randomisation is not None:
+            # The preset alone, without the ranges that the training changed.
+            given |= dict.fromkeys(option_names(RandomisationConfig))
+            given |= {"randomisation": self.randomisation, "growth_steps": 0}
         return load_agent(self.agent, max_steps=self.max_steps, scene=self.scene, **given)
 
     def key(self) -> jax.Array:
