@@ -60,9 +60,9 @@ def validate_geoms(mj_model: mujoco.MjModel, varies: Varies | None = None) -> No
       varies: rows of the model that vary by episode.
 
     Raises:
-      ValueError: a visible geom is no plane, box, sphere, capsule or cylinder, or has a texture that
-        cannot be rendered; a spatial tendon, flex or skin is visible; or there are more than 255
-        geoms.
+      ValueError: a visible geom is no plane, box, sphere, capsule or cylinder, or has a texture
+        that cannot be rendered; a spatial tendon, flex or skin is visible; or there are more than
+        255 geoms.
     """
     if mj_model.ngeom > MAX_GEOMS:
         raise ValueError(

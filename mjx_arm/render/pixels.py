@@ -1,4 +1,4 @@
-"""Arithmetic on packed pixels: two channels at a time, in whole numbers, the same on every device."""
+"""Arithmetic on packed pixels, two channels at a time; in whole numbers, the same everywhere."""
 
 from __future__ import annotations
 

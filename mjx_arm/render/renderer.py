@@ -162,19 +162,19 @@ def make_renderer(
     every frame.
 
     The image follows MuJoCo's own renderer. It shows geoms of the groups 0, 1 and 2 with alpha
-    above zero, all opaque, in plain colours; planes and boxes may have 2D and cube textures. Light is
-    the sum of ambient light, any number of directional lights, and the headlight; pixels that hit
-    nothing are black. A shadow removes the diffuse part of its light. Not rendered are sites, rangefinder rays, specular light, emission,
-    reflections, the skybox, geoms around the camera, and planes from behind. There is no near or
-    far clipping.
+    above zero, all opaque, in plain colours; planes and boxes may have 2D and cube textures. Light
+    is the sum of ambient light, any number of directional lights, and the headlight; pixels that
+    hit nothing are black. A shadow removes the diffuse part of its light. Not rendered are sites,
+    rangefinder rays, specular light, emission, reflections, the skybox, geoms around the camera,
+    and planes from behind. There is no near or far clipping.
 
     Args:
       scene: an `MjModel`, or an object with one as `mj_model`.
       camera: name of a perspective camera of mode `fixed`, on any body.
       size: height and width of the image, pixels.
       shadows: whether directional lights cast hard shadows, where the model's `castshadow` says so.
-      samples: rays through each pixel: 1, 4 or 16. Colours are their mean; the geom id and the depth
-        are those of one of them, since a mean would be neither.
+      samples: rays through each pixel: 1, 4 or 16. Colours are their mean; the geom id and the
+        depth are those of one of them, since a mean would be neither.
       depth: whether to return a second array: z-depth along the optical axis, `[H, W] float32`,
         m, infinite where nothing is hit.
       varies: rows of the model that vary by episode. Fields that do not concern the image are

@@ -1,4 +1,7 @@
-"""What a camera does to an image: blur, exposure, noise. Whole numbers, the same on every device."""
+"""What a camera does to an image: blur, exposure and noise.
+
+All in whole numbers, which are the same on every device.
+"""
 
 from __future__ import annotations
 

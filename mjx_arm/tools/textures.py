@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import pathlib
+import sys
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -130,7 +131,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="Writes the textures of the desk scene.")
     parser.add_argument("folder", type=pathlib.Path, help="where the scenes are")
     for path in write_textures(parser.parse_args().folder):
-        print(path)
+        sys.stdout.write(f"{path}\n")
 
 
 if __name__ == "__main__":

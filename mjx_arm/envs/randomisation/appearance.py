@@ -260,7 +260,7 @@ def _sensor(ranges: Ranges) -> list[Part]:
         )
     if not is_fixed(ranges.image_noise, 0.0):
         names = ("image_noise", "image_seed")
-        parts.append(Part({name: (0,) for name in names}, 2, lambda u, g: _noise(u, ranges, g)))
+        parts.append(Part(dict.fromkeys(names, (0,)), 2, lambda u, g: _noise(u, ranges, g)))
     if ranges.image_delay:
         parts.append(
             Part(

@@ -122,8 +122,8 @@ class RandomisationConfig:
         return dataclasses.replace(preset, **given)
 
 
-# Beyond these servos oscillate (`2 h kv / m + h h kp / m` must stay below 4, and is 2.4), or the cube
-# does not fit into the gripper, which closes to 84 % of it; see xml/arm_cube.xml.
+# Beyond these servos oscillate (`2 h kv / m + h h kp / m` must stay below 4, and is 2.4), or the
+# cube does not fit into the gripper, which closes to 84 % of it; see xml/arm_cube.xml.
 _LIMITS = {
     "cube_size": (0.86, 1.5),
     "servo_gain": (0.3, 1.6),
@@ -169,9 +169,9 @@ class Ranges:
 
 
 # From Squint: `ambient_light`, and `camera_shift` and `view_change` of `tight`. Its cube has 88 to
-# 112 % of the mean edge; our gripper does not close on less than 84 %, so that 92 % is our least. Its
-# friction (0.1 to 0.5) and stiffness of the gripper (500 to 2,000) span a factor of 4 to 5; ours must
-# leave servos stable and the cube graspable. From Playground, in `standard`: `cube_red`,
+# 112 % of the mean edge; our gripper does not close on less than 84 %, so that 92 % is our least.
+# Its friction (0.1 to 0.5) and stiffness of the gripper (500 to 2,000) span a factor of 4 to 5; ours
+# must leave servos stable and the cube graspable. From Playground, in `standard`: `cube_red`,
 # `camera_shift`, `camera_turn`, `light_angle` and `shadow_share`. All others are our choice.
 PRESETS: Mapping[str, Ranges] = {
     "off": Ranges(),

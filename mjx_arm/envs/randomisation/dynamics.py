@@ -1,4 +1,4 @@
-"""What randomisation does to the physics: masses, sizes, friction, servos and the delay of actions."""
+"""What randomisation does to the physics: masses, sizes, friction, servos, late actions."""
 
 from __future__ import annotations
 
