@@ -170,8 +170,8 @@ class Ranges:
 
 # From Squint: `ambient_light`, and `camera_shift` and `view_change` of `tight`. Its cube has 88 to
 # 112 % of the mean edge; our gripper does not close on less than 84 %, so that 92 % is our least.
-# Its friction (0.1 to 0.5) and stiffness of the gripper (500 to 2,000) span a factor of 4 to 5; ours
-# must leave servos stable and the cube graspable. From Playground, in `standard`: `cube_red`,
+# Its friction (0.1 to 0.5) and stiffness of the gripper (500 to 2,000) span a factor of 4 to 5;
+# ours must leave servos stable and the cube graspable. From Playground, in `standard`: `cube_red`,
 # `camera_shift`, `camera_turn`, `light_angle` and `shadow_share`. All others are our choice.
 PRESETS: Mapping[str, Ranges] = {
     "off": Ranges(),
