@@ -51,7 +51,7 @@ def test_every_number_of_the_physics_is_the_same(models) -> None:
         values = getattr(plain, field)
         if field.startswith(IMAGE + DERIVED) or not isinstance(values, np.ndarray):
             continue
-        if not field.startswith(KINDS + ("dof_", "qpos", "exclude", "wrap")):
+        if not field.startswith((*KINDS, "dof_", "qpos", "exclude", "wrap")):
             continue
         other = getattr(desk, field)
         np.testing.assert_array_equal(other[: len(values)], values, err_msg=field)
