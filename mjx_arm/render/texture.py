@@ -76,6 +76,11 @@ def make_atlas(mj_model: mujoco.MjModel) -> Atlas:
     )
 
 
+def mean_colour(mj_model: mujoco.MjModel, texture: int) -> np.ndarray:
+    """The mean of a texture's pixels, `[3] float64` in 0..1."""
+    return np.mean(_images(mj_model, texture), axis=(0, 1, 2)) / 255
+
+
 def _images(mj_model: mujoco.MjModel, texture: int) -> list[np.ndarray]:
     """The image of a 2D texture, or of a cube's faces where they differ: `[W, W, 3]` in 0..255."""
     width, height, channels = (
