@@ -164,7 +164,7 @@ class _Lookup(NamedTuple):
       s: first coordinate, 0..1 from the left to the right edge of the texture.
       t: second coordinate, 0..1 from the top to the bottom edge.
       density: textures side by side on a metre of the surface, 1/m.
-      facing: component of the ray's direction along the normal of the face.
+      normal: form of the ray's component along the normal of the face: its three coefficients.
       start: where the face's texels begin.
       levels: log2 of the texture's edge.
       clamped: whether the texture ends at its edges instead of repeating.
@@ -173,7 +173,7 @@ class _Lookup(NamedTuple):
     s: jax.Array
     t: jax.Array
     density: jax.Array
-    facing: jax.Array
+    normal: tuple[jax.Array, jax.Array, jax.Array]
     start: jax.Array
     levels: jax.Array
     clamped: jax.Array
@@ -216,7 +216,8 @@ def apply_textures(
 
 
 def _where(condition: jax.Array, one: _Lookup, other: _Lookup) -> _Lookup:
-    return _Lookup(*(jnp.where(condition, a, b) for a, b in zip(one, other, strict=True)))
+    chosen: _Lookup = jax.tree.map(lambda a, b: jnp.where(condition, a, b), one, other)
+    return chosen
 
 
 def _look(
@@ -237,7 +238,7 @@ def _look(
     inverse = 1 / jnp.where(size > 0, size, jnp.ones_like(size))
     scale = jnp.ones_like(inverse) if skin.uniform else inverse
     point = [o + depth * ray for o, ray in zip(origin, rays, strict=True)]
-    facing = _facing(point, rays, inverse) if skin.box else jnp.broadcast_to(rays[2], depth.shape)
+    normal = _normal_of_box(point, forms, inverse) if skin.box else forms[2]
     number = jnp.asarray(papers.texture[skin.material]).astype(jnp.int32)
     start, levels = jnp.asarray(atlas.start)[number], jnp.asarray(atlas.levels)[number]
     if skin.cube:
@@ -247,16 +248,21 @@ def _look(
         repeat = jnp.asarray(papers.repeat[skin.material], jnp.float32) * scale[:2] / 2
         s, t = repeat[0] * point[0] - 0.5, -repeat[1] * point[1] - 0.5
         density = jnp.max(repeat)
-    density, start, levels = (jnp.broadcast_to(x, depth.shape) for x in (density, start, levels))
-    clamped = jnp.full(depth.shape, skin.cube)
-    return _Lookup(s, t, density, facing, start, levels, clamped)
+    parts = _Lookup(
+        s, t, density, (normal[0], normal[1], normal[2]), start, levels, jnp.asarray(skin.cube)
+    )
+    whole: _Lookup = jax.tree.map(lambda x: jnp.broadcast_to(x, depth.shape), parts)
+    return whole
 
 
-def _facing(point: list[jax.Array], rays: list[jax.Array], inverse: jax.Array) -> jax.Array:
-    """Component of the ray along the normal of the box's face at each pixel, `[H, W]`."""
+def _normal_of_box(point: list[jax.Array], forms: jax.Array, inverse: jax.Array) -> list[jax.Array]:
+    """The form of the axis that the box's face at each pixel is across, 3 times `[H, W]`."""
     reach = [jnp.abs(x) * k for x, k in zip(point, inverse, strict=True)]
-    flat = jnp.where(reach[1] > reach[0], rays[1], rays[0])
-    return jnp.where(reach[2] > greater(reach[0], reach[1]), rays[2], flat)
+    along_y, along_z = reach[1] > reach[0], reach[2] > greater(reach[0], reach[1])
+    return [
+        jnp.where(along_z, forms[2, i], jnp.where(along_y, forms[1, i], forms[0, i]))
+        for i in range(3)
+    ]
 
 
 def _on_cube(
@@ -283,15 +289,13 @@ def _sample(
     look: _Lookup, depth: jax.Array, setting: Setting, atlas: Atlas
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Red, green and blue of the textures, each `[H, W] float32` in 0..255."""
-    # How far the surface moves from one pixel to the next, in edges of the texture.
-    pixel = 2 * jnp.sqrt(jnp.sum(setting.view.basis[:, 1] ** 2)) / depth.shape[0]
-    slant = jnp.sqrt(setting.rays.norm2) / (jnp.abs(look.facing) + _TINY)
-    step = pixel * depth * look.density * slant
-    # The exponent of a float is the whole part of its log2, and the factor rounds it.
-    bits = jax.lax.bitcast_convert_type(step * np.float32(np.sqrt(2)), jnp.int32)
-    level = jnp.clip(look.levels + (bits >> 23) - 127, 0, look.levels)
-    # The sizes before this one have 4^n + 4^(n-1) + ... texels.
+    step2 = _footprint2(look, depth, setting)
+    # The exponent of a float is the whole part of its log2: half of that of 2 x² is the nearest to
+    # log2(x).
+    bits = jax.lax.bitcast_convert_type(2 * step2, jnp.int32)
+    level = jnp.clip(look.levels + (((bits >> 23) - 127) >> 1), 0, look.levels)
     left = look.levels - level
+    # The sizes before this one have 4^n + 4^(n-1) + ... texels.
     before = ((4 << (2 * look.levels)) - (4 << (2 * left))) // 3
     start, mask = look.start + before, (1 << left) - 1
     edge = (1 << left).astype(jnp.float32)
@@ -306,6 +310,24 @@ def _sample(
         for column in columns
     ]
     return _mix(corners, x - x0, y - y0)
+
+
+def _footprint2(look: _Lookup, depth: jax.Array, setting: Setting) -> jax.Array:
+    """Square of how far the texture moves from a pixel to the next, in its edges, `[H, W]`.
+
+    The larger one of the ways to the right and upwards, as in OpenGL 4.6, equation 8.9. The point
+    of a plane with normal n that the ray d meets at depth z moves by `z (r - d (r n) / (d n))`
+    when the ray moves by r.
+    """
+    rays, (height, width) = setting.rays, depth.shape
+    facing = look.normal[0] * rays.u + (look.normal[1] * rays.v + look.normal[2])
+    inverse = 1 / jnp.where(jnp.abs(facing) < _TINY, _TINY, facing)
+    right2, up2, _ = jnp.sum(setting.view.basis**2, axis=0)
+    right, up = look.normal[0] * inverse, look.normal[1] * inverse
+    across2 = right2 * (1 - 2 * rays.u * right) + rays.norm2 * right * right
+    along2 = up2 * (1 - 2 * rays.v * up) + rays.norm2 * up * up
+    ways = greater(across2 * (2 / width) ** 2, along2 * (2 / height) ** 2)
+    return ways * (depth * look.density) ** 2
 
 
 def _wrap(place: jax.Array, mask: jax.Array, clamped: jax.Array) -> jax.Array:
