@@ -1,10 +1,10 @@
 """Textures of planes and boxes, mapped as MuJoCo's OpenGL renderer maps them.
 
-A 2D texture is projected along the geom's own z axis, and repeats. With x in units of the geom's
-half length (of metres, where the plane is infinite or the material says `texuniform`) its first
-coordinate is `(texrepeat * x - 1) / 2`, and the second the same of -y. A cube texture is looked up
-in the direction from the geom's centre, in the same units, on the face of the largest component.
-See `settexture` in MuJoCo's render_gl3.c.
+A 2D texture covers each face of a box, and the whole of a finite plane, `texrepeat` times along
+both axes; with `texuniform` it is repeated as often again as the geom's half length has metres. On
+an infinite plane it repeats every `2 / texrepeat` metres. A cube texture is looked up in the direction
+from the geom's centre, in half lengths or, with `texuniform`, in metres, on the face of the largest
+component. `tests/render/test_texture.py` compares each case with what MuJoCo 3.17 shows.
 
 Each texture is kept at all sizes down to one pixel. At every pixel of the image the size is taken
 whose texels are nearest to the pixel's footprint, and four texels are interpolated. OpenGL
@@ -236,43 +236,70 @@ def _look(
     size = jnp.asarray(setting.sizes[skin.geom], jnp.float32)
     # An infinite plane has the size 0, and repeats its texture by metres.
     inverse = 1 / jnp.where(size > 0, size, jnp.ones_like(size))
-    scale = jnp.ones_like(inverse) if skin.uniform else inverse
     point = [o + depth * ray for o, ray in zip(origin, rays, strict=True)]
-    normal = _normal_of_box(point, forms, inverse) if skin.box else forms[2]
+    unit = [x * k for x, k in zip(point, inverse, strict=True)]
     number = jnp.asarray(papers.texture[skin.material]).astype(jnp.int32)
     start, levels = jnp.asarray(atlas.start)[number], jnp.asarray(atlas.levels)[number]
+    normal = _normal_of_box(unit, forms) if skin.box else (forms[2, 0], forms[2, 1], forms[2, 2])
     if skin.cube:
-        s, t, density, face = _on_cube(point, scale)
+        s, t, density, face = _on_cube(*((point, 1.0) if skin.uniform else (unit, inverse)))
         start = start + jnp.asarray(atlas.stride)[number] * face
     else:
-        repeat = jnp.asarray(papers.repeat[skin.material], jnp.float32) * scale[:2] / 2
-        s, t = repeat[0] * point[0] - 0.5, -repeat[1] * point[1] - 0.5
-        density = jnp.max(repeat)
-    parts = _Lookup(
-        s, t, density, (normal[0], normal[1], normal[2]), start, levels, jnp.asarray(skin.cube)
-    )
+        repeat = jnp.asarray(papers.repeat[skin.material], jnp.float32) / 2
+        repeat = repeat / inverse[:2] if skin.uniform else repeat
+        place = _on_box(unit, inverse) if skin.box else (unit[0], unit[1], inverse[0], inverse[1])
+        begin = jnp.where(size[:2] > 0, repeat, -0.5)
+        s, t = begin[0] + repeat[0] * place[0], begin[1] - repeat[1] * place[1]
+        density = greater(repeat[0] * place[2], repeat[1] * place[3])
+    parts = _Lookup(s, t, density, normal, start, levels, jnp.asarray(skin.cube))
     whole: _Lookup = jax.tree.map(lambda x: jnp.broadcast_to(x, depth.shape), parts)
     return whole
 
 
-def _normal_of_box(point: list[jax.Array], forms: jax.Array, inverse: jax.Array) -> list[jax.Array]:
-    """The form of the axis that the box's face at each pixel is across, 3 times `[H, W]`."""
-    reach = [jnp.abs(x) * k for x, k in zip(point, inverse, strict=True)]
-    along_y, along_z = reach[1] > reach[0], reach[2] > greater(reach[0], reach[1])
-    return [
-        jnp.where(along_z, forms[2, i], jnp.where(along_y, forms[1, i], forms[0, i]))
+def _face_of_box(unit: list[jax.Array]) -> tuple[jax.Array, jax.Array]:
+    """Whether the face at each pixel is across y, and across z; otherwise it is across x."""
+    reach = [jnp.abs(x) for x in unit]
+    across_z = reach[2] > greater(reach[0], reach[1])
+    return ~across_z & (reach[1] > reach[0]), across_z
+
+
+def _normal_of_box(
+    unit: list[jax.Array], forms: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """The form of the axis that the face at each pixel is across."""
+    across_y, across_z = _face_of_box(unit)
+    x, y, z = (
+        jnp.where(across_z, forms[2, i], jnp.where(across_y, forms[1, i], forms[0, i]))
         for i in range(3)
-    ]
+    )
+    return x, y, z
+
+
+def _on_box(
+    unit: list[jax.Array], inverse: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+    """Coordinates along the face in half lengths, and one over these half lengths, 1/m.
+
+    They are y and z on a face across x, x and z on one across y, and x and y on one across z.
+    """
+    across_y, across_z = _face_of_box(unit)
+    across_x = ~across_y & ~across_z
+    return (
+        jnp.where(across_x, unit[1], unit[0]),
+        jnp.where(across_z, unit[1], unit[2]),
+        jnp.where(across_x, inverse[1], inverse[0]),
+        jnp.where(across_z, inverse[1], inverse[2]),
+    )
 
 
 def _on_cube(
-    point: list[jax.Array], scale: jax.Array
+    direction: list[jax.Array], scale: jax.Array | float
 ) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
     """Coordinates s and t, density and face 0 to 5 (+x, -x, +y, -y, +z, -z), each `[H, W]`.
 
-    OpenGL 4.6, table 8.19.
+    Table 8.19 of OpenGL 4.6. `scale` has the units of `direction` in a metre, `[3]` or one number.
     """
-    x, y, z = (value * k for value, k in zip(point, scale, strict=True))
+    x, y, z = direction
     along_z = jnp.abs(z) >= greater(jnp.abs(x), jnp.abs(y))
     along_x = ~along_z & (jnp.abs(x) >= jnp.abs(y))
     major = jnp.where(along_z, z, jnp.where(along_x, x, y))

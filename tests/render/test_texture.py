@@ -51,28 +51,51 @@ ABOVE = '<camera name="front" pos="0 0 1" fovy="90"/>'
 FLAT = '<texture name="t" type="2d" file="image.png" colorspace="linear"/>'
 
 
+def turned(shift: tuple[int, int]) -> np.ndarray:
+    return np.roll(RANDOM, shift, (0, 1))
+
+
 @pytest.mark.parametrize(
     ("geom", "material", "expected"),
     [
         # Over the whole of a finite plane, the first row of the file at its far end.
         ('type="plane" size="1 1 1"', "", RANDOM),
+        ('type="plane" size="1 1 1"', 'texrepeat="2 2"', np.tile(RANDOM, (2, 2, 1))),
         # By metres from the middle: one texture in two metres.
         ('type="plane" size="0 0 1"', "", RANDOM),
-        ('type="plane" size="2 2 1"', 'texuniform="true"', RANDOM),
-        ('type="plane" size="1 1 1"', 'texrepeat="2 2"', np.roll(RANDOM, (4, 4), (0, 1))),
+        ('type="plane" size="0 0 1"', 'texrepeat="2 2"', np.tile(turned((4, 4)), (2, 2, 1))),
+        # Twice over four metres, of which the middle two are seen.
+        ('type="plane" size="2 2 1"', 'texuniform="true"', turned((4, 4))),
         ('type="box" size="1 1 0.5" pos="0 0 -0.5"', "", RANDOM),
+        ('type="box" size="2 2 0.5" pos="0 0 -0.5"', 'texuniform="true"', turned((4, 4))),
     ],
 )
 def test_a_2d_texture_by_hand(geom: str, material: str, expected: np.ndarray) -> None:
-    repeats = 2 if "texrepeat" in material else 1
     scene = textured(
         f'{ABOVE}<geom {geom} material="m"/>', f'{FLAT}<material name="m" texture="t" {material}/>'
     )
-    image = image_of(scene, (8 * repeats, 8 * repeats))
-    if repeats == 2:
-        # s = x - 1/2: half a texture is left of the middle of each repetition.
-        expected = np.tile(expected, (2, 2, 1))
-    np.testing.assert_allclose(image, expected, atol=1)
+    np.testing.assert_allclose(image_of(scene, expected.shape[:2]), expected, atol=1)
+
+
+@pytest.mark.parametrize(
+    ("camera", "right", "up"),
+    [
+        ('pos="1.5 0 0" xyaxes="0 1 0 0 0 1"', 1, 1),
+        ('pos="-1.5 0 0" xyaxes="0 -1 0 0 0 1"', -1, 1),
+        ('pos="0 -1.5 0" xyaxes="1 0 0 0 0 1"', 1, 1),
+        ('pos="0 1.5 0" xyaxes="-1 0 0 0 0 1"', -1, 1),
+        ('pos="0 0 -1.5" xyaxes="1 0 0 0 -1 0"', 1, -1),
+    ],
+)
+def test_each_side_of_a_box_by_hand(camera: str, right: int, up: int) -> None:
+    scene = textured(
+        f'<camera name="front" {camera} fovy="90"/>'
+        '<geom type="box" size="0.5 0.5 0.5" material="m"/>',
+        f'{FLAT}<material name="m" texture="t"/>',
+    )
+    # The face is one metre from the camera and one metre wide, half of the image.
+    image = image_of(scene, (16, 16))[4:12, 4:12]
+    np.testing.assert_allclose(image, RANDOM[::up, ::right], atol=1)
 
 
 def test_a_texture_multiplies_the_colour() -> None:
