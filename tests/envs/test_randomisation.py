@@ -17,6 +17,7 @@ from mjx_arm.envs.auto_reset import AutoReset
 from mjx_arm.envs.env import Env, make_env
 from mjx_arm.envs.randomisation import PRESETS, RandomisationConfig, make_randomiser
 from mjx_arm.envs.scripted import make_scripted_policy
+from mjx_arm.render.geoms import geom_rgba
 from mjx_arm.scene import load_scene
 from mjx_arm.training.agent import evaluation_config
 from mjx_arm.varies import own_params, rows
@@ -72,6 +73,8 @@ def test_at_growth_0_an_episode_is_the_scene_itself(model, preset: str) -> None:
     params = randomiser.sample(jax.random.key(0), 0.0)
     own = own_params(model, randomiser.varies)
     assert set(params) == set(own)
+    # Where a geom has no colour of its own, that of its material.
+    own["geom_rgba"] = geom_rgba(model)[list(randomiser.varies["geom_rgba"])]
     for name, values in params.items():
         if name == "light_dir":  # of length 1
             own[name] /= np.linalg.norm(own[name], axis=1, keepdims=True)
