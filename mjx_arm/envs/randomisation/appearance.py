@@ -18,6 +18,7 @@ from mjx_arm.envs.randomisation.parts import (
     geoms_of,
     is_fixed,
     largest_delay,
+    scaled,
 )
 from mjx_arm.render.geoms import geom_rgba, texture_of, visible_geoms, why_not_rendered
 from mjx_arm.varies import Params, rows
@@ -116,7 +117,7 @@ def _texture_scale(model: mujoco.MjModel, ranges: Ranges) -> Part | None:
 
     def make(uniform: jax.Array, growth: Growth) -> Params:
         factor = between(uniform, *ranges.texture_scale, 1.0, growth)
-        return {"mat_texrepeat": own * factor[:, None]}
+        return {"mat_texrepeat": scaled(own, factor[:, None])}
 
     return Part({"mat_texrepeat": tuple(ids)}, len(ids), make)
 
@@ -165,7 +166,7 @@ def _light_strength(model: mujoco.MjModel, ranges: Ranges) -> Part | None:
 
     def make(uniform: jax.Array, growth: Growth) -> Params:
         factor = between(uniform, *ranges.light_strength, 1.0, growth)
-        return {"light_diffuse": own * factor[:, None]}
+        return {"light_diffuse": scaled(own, factor[:, None])}
 
     return Part({"light_diffuse": tuple(ids)}, len(ids), make)
 
@@ -204,7 +205,7 @@ def _camera_shift(model: mujoco.MjModel, ranges: Ranges, ids: list[int]) -> Part
 
     def make(uniform: jax.Array, growth: Growth) -> Params:
         shift = growth * ranges.camera_shift * (2 * uniform.reshape(-1, 3) - 1)
-        return {"cam_pos": own + shift}
+        return {"cam_pos": jnp.asarray(own) + shift}
 
     return Part({"cam_pos": tuple(ids)}, 3 * len(ids), make)
 
@@ -243,7 +244,7 @@ def _field_of_view(model: mujoco.MjModel, ranges: Ranges, ids: list[int]) -> Par
     own = rows(model, "cam_fovy")[ids]
 
     def make(uniform: jax.Array, growth: Growth) -> Params:
-        return {"cam_fovy": own + growth * ranges.view_change * (2 * uniform - 1)}
+        return {"cam_fovy": jnp.asarray(own) + growth * ranges.view_change * (2 * uniform - 1)}
 
     return Part({"cam_fovy": tuple(ids)}, len(ids), make)
 

@@ -16,6 +16,7 @@ from mjx_arm.envs.randomisation.parts import (
     geoms_of,
     is_fixed,
     largest_delay,
+    scaled,
 )
 from mjx_arm.varies import Params, rows
 
@@ -44,7 +45,7 @@ def _links(model: mujoco.MjModel, ranges: Ranges) -> Part | None:
 
     def make(uniform: jax.Array, growth: Growth) -> Params:
         factor = between(uniform, *ranges.link_mass, 1.0, growth)
-        return {"body_mass": mass * factor, "body_inertia": inertia * factor[:, None]}
+        return {"body_mass": scaled(mass, factor), "body_inertia": scaled(inertia, factor[:, None])}
 
     return Part({"body_mass": tuple(ids), "body_inertia": tuple(ids)}, len(ids), make)
 
@@ -58,6 +59,7 @@ def _objects(model: mujoco.MjModel, ranges: Ranges) -> Part | None:
     geoms = geoms_of(model, bodies)
     apart = [i for i in geoms if model.geom_pos[i].any()]
     mass, inertia = rows(model, "body_mass")[bodies], rows(model, "body_inertia")[bodies]
+    sizes, places = rows(model, "geom_size")[geoms], rows(model, "geom_pos")[apart]
     varies = {"body_inertia": tuple(bodies)}
     if weighed:
         varies["body_mass"] = tuple(bodies)
@@ -73,12 +75,12 @@ def _objects(model: mujoco.MjModel, ranges: Ranges) -> Part | None:
         size = between(uniform[:, 0], *ranges.cube_size, 1.0, growth)
         weight = between(uniform[:, 1], *ranges.cube_mass, 1.0, growth)
         # Of a body of one shape: mass times the square of its size.
-        params = {"body_inertia": inertia * (weight * size * size)[:, None]}
+        params = {"body_inertia": scaled(inertia, (weight * size * size)[:, None])}
         if weighed:
-            params["body_mass"] = mass * weight
+            params["body_mass"] = scaled(mass, weight)
         if sized:
-            params["geom_size"] = rows(model, "geom_size")[geoms] * size[of_geom][:, None]
-            params["geom_pos"] = rows(model, "geom_pos")[apart] * size[of_apart][:, None]
+            params["geom_size"] = scaled(sizes, size[of_geom][:, None])
+            params["geom_pos"] = scaled(places, size[of_apart][:, None])
         return params
 
     return Part(varies, 2 * len(bodies), make)
@@ -103,7 +105,7 @@ def _friction(model: mujoco.MjModel, ranges: Ranges) -> Part | None:
 
     def make(uniform: jax.Array, growth: Growth) -> Params:
         factor = between(uniform, *ranges.friction, 1.0, growth)
-        return {field: own * factor[which][:, None]}
+        return {field: scaled(own, factor[which][:, None])}
 
     return Part({field: tuple(ids)}, 2, make)
 
@@ -126,7 +128,7 @@ def _servos(model: mujoco.MjModel, ranges: Ranges) -> Part | None:
         factors = jnp.stack([stiffness, stiffness, damping], axis=1)
         params = {"actuator_biasprm": jnp.concatenate([bias[:, :3] * factors, bias[:, 3:]], axis=1)}
         if stiff:
-            params["actuator_gainprm"] = gain * stiffness[:, None]
+            params["actuator_gainprm"] = scaled(gain, stiffness[:, None])
         return params
 
     return Part(varies, 2 * len(ids), make)

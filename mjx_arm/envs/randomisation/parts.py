@@ -49,7 +49,14 @@ def between(
       growth: share of the range.
     """
     value = least + uniform * (greatest - least)
-    return value if isinstance(growth, float) and growth == 1.0 else own + growth * (value - own)
+    if isinstance(growth, float) and growth == 1.0:
+        return value
+    return jnp.asarray(own + growth * (value - own))
+
+
+def scaled(own: np.ndarray, factor: jax.Array) -> jax.Array:
+    """What the scene has times a factor."""
+    return jnp.asarray(own) * factor
 
 
 def is_fixed(values: tuple[float, float], own: float) -> bool:
