@@ -2,9 +2,9 @@
 
 A 2D texture covers each face of a box, and the whole of a finite plane, `texrepeat` times along
 both axes; with `texuniform` it is repeated as often again as the geom's half length has metres. On
-an infinite plane it repeats every `2 / texrepeat` metres. A cube texture is looked up in the direction
-from the geom's centre, in half lengths or, with `texuniform`, in metres, on the face of the largest
-component. `tests/render/test_texture.py` compares each case with what MuJoCo 3.17 shows.
+an infinite plane it repeats every `2 / texrepeat` metres. A cube texture is looked up in the
+direction from the geom's centre, in half lengths or, with `texuniform`, in metres, on the face of
+the largest component. `tests/render/test_texture.py` compares each case with MuJoCo 3.17.
 
 Each texture is kept at all sizes down to one pixel. At every pixel of the image the size is taken
 whose texels are nearest to the pixel's footprint, and four texels are interpolated. OpenGL
