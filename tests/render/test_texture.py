@@ -14,7 +14,7 @@ from mujoco_reference import at, scene_of
 from PIL import Image
 
 from mjx_arm import make_renderer, rgb, segmentation
-from mjx_arm.scene import Scene, SceneSource, compile_scene
+from mjx_arm.scene import Scene, SceneSource, compile_scene, load_scene
 
 RANDOM = np.random.default_rng(0).integers(0, 256, (8, 8, 3), dtype=np.uint8)
 
@@ -244,17 +244,19 @@ def test_textures_that_cannot_be_rendered_are_refused(geom: str, assets: str, me
 
 @pytest.mark.skipif(jax.default_backend() != "cpu", reason="concerns XLA's fusion on CPU")
 def test_the_ray_cast_is_not_repeated_for_each_texel() -> None:
-    scene = textured(BOXES, SIX)
+    scene = load_scene("arm_cube_desk")
     data = at(scene.mj_model)
     camera = scene.mj_model.cam_pos[0].astype(np.float32)
     render = make_renderer(scene, size=(8, 8), varies={"cam_pos": (0,)})
     frames = jax.vmap(render, in_axes=(None, None, 0))
     params = {"cam_pos": jnp.tile(camera, (2, 1, 1))}
     program = jax.jit(frames).lower(data.geom_xpos, data.geom_xmat, params).compile().as_text()
-    # The inverse depths of the boxes are compared with one another in one kernel only.
-    kernels = [kernel for kernel in program.split("\n\n") if " gather(" in kernel]
-    assert kernels
-    assert all(kernel.count(" compare(") < 80 for kernel in kernels)
+    # Gathers stand for texels, and roots for the round shapes of the arm.
+    kernels = program.split("\n\n")
+    looking_up = [kernel for kernel in kernels if " gather(" in kernel]
+    assert looking_up
+    assert any(" sqrt(" in kernel for kernel in kernels)
+    assert not any(" sqrt(" in kernel for kernel in looking_up)
 
 
 def test_a_plain_scene_has_no_textures_in_its_program() -> None:
