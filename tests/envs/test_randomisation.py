@@ -165,19 +165,17 @@ def test_masses_and_inertias_go_together(model) -> None:
 
 
 def _rollout(env: Env, steps: int, count: int = 3):
-    """States and observations of a scripted policy, with resets: `[steps, count, ...]`."""
-    auto, policy = AutoReset(env), make_scripted_policy(env)
-    frames = make_frames(env, "states")
-    keys = jax.random.split(jax.random.key(5), count)
+    """States, observations and frames of random actions, with resets: `[steps, count, ...]`."""
+    auto, frames = AutoReset(env), make_frames(env, "states")
 
     def step(envs, key):
-        action = jax.vmap(policy)(envs.env)
+        action = jax.random.randint(key, (count,), 0, env.num_actions)
         obs = frames.observe(envs)
         frame = frames.encode(envs, obs)
         after, _ = jax.vmap(auto.transition)(jax.random.split(key, count), envs, action)
         return after, (envs.env, obs, frame)
 
-    envs = jax.vmap(auto.reset)(keys)[1]
+    envs = jax.vmap(auto.reset)(jax.random.split(jax.random.key(5), count))[1]
     return jax.lax.scan(step, envs, jax.random.split(jax.random.key(6), steps))[1]
 
 
