@@ -19,7 +19,7 @@ import re
 import statistics
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -61,7 +61,9 @@ def variants(folder: pathlib.Path) -> dict[str, dict[str, Any]]:
     }
 
 
-def stages(options: dict[str, Any], num_envs: int, length: int) -> dict[str, Callable[[], Any]]:
+def stages(
+    options: dict[str, Any], num_envs: int, length: int, wanted: Sequence[str]
+) -> dict[str, Callable[[], Any]]:
     """Compiled functions that render, and that step and render, `num_envs * length` frames."""
     env = mjx_arm.make("B", physics="native", observation="packed", **options)
     auto, flags = mjx_arm.AutoReset(env), compiler_options(env.physics)
@@ -91,8 +93,9 @@ def stages(options: dict[str, Any], num_envs: int, length: int) -> dict[str, Cal
 
         return jax.lax.scan(once, carry, jax.random.split(jax.random.key(1), length))[0]
 
-    carry = state, jax.jit(observe)(state)
-    made = {"render": (render, state), "step": (step, carry)}
+    empty = jnp.zeros((num_envs, *env.config.size), jnp.uint32)
+    made = {"render": (render, state), "step": (step, (state, empty))}
+    made = {name: made[name] for name in wanted}
     return {
         name: functools.partial(jax.jit(run, compiler_options=flags).lower(x).compile(), x)
         for name, (run, x) in made.items()
@@ -111,7 +114,7 @@ def summarise(rounds: list[dict[str, dict[str, float]]]) -> list[dict[str, Any]]
     rows = []
     for name in rounds[0]:
         row: dict[str, Any] = {"variant": name}
-        for stage in STAGES:
+        for stage in rounds[0][name]:
             ratios = [x[name][stage] / x[PLAIN][stage] for x in rounds]
             row[stage] = {
                 "ratio": round(statistics.median(ratios), 3),
@@ -129,6 +132,7 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=7)
     parser.add_argument("--num-envs", type=int, default=64)
     parser.add_argument("--work", type=int, default=4096, help="frames of a timed call")
+    parser.add_argument("--stages", nargs="+", default=STAGES, choices=STAGES)
     parser.add_argument("--only", nargs="+", help="variants beside the plain one; default all")
     parser.add_argument("--json", type=pathlib.Path, help="file for the results")
     options = parser.parse_args()
@@ -137,7 +141,7 @@ def main() -> None:
         chosen = variants(pathlib.Path(folder))
         wanted = chosen if options.only is None else {PLAIN, *options.only}
         made = {
-            name: stages(values, options.num_envs, length)
+            name: stages(values, options.num_envs, length, options.stages)
             for name, values in chosen.items()
             if name in wanted
         }
@@ -156,13 +160,13 @@ def main() -> None:
         if options.json:
             report = {"machine": machine(), "load": loads, "rounds": len(rounds), "rows": table}
             options.json.write_text(json.dumps(report, indent=1) + "\n")
-    print(f"{'variant':<28}{'render':>8}{'least':>7}{'most':>7}{'/s':>9}{'step':>8}{'/s':>9}")
     for row in table:
-        render, step = row["render"], row["step"]
-        print(
-            f"{row['variant']:<28}{render['ratio']:>8.3f}{render['least']:>7.3f}"
-            f"{render['most']:>7.3f}{render['per_s']:>9,}{step['ratio']:>8.3f}{step['per_s']:>9,}"
-        )
+        for stage in options.stages:
+            cell = row[stage]
+            print(
+                f"{row['variant']:<28}{stage:<8}{cell['ratio']:>7.3f} of plain, "
+                f"{cell['least']:.3f} to {cell['most']:.3f}{cell['per_s']:>10,}/s"
+            )
 
 
 if __name__ == "__main__":

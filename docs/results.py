@@ -144,6 +144,9 @@ def _desk(content: Any) -> Table:
     for row in content["rows"]:
         cells = [row["variant"]]
         for stage in ("render", "step"):
+            if stage not in row:
+                cells += ["not measured"] * 2
+                continue
             cell = row[stage]
             cells += [f"{cell['ratio']:.2f} ({cell['least']:.2f} to {cell['most']:.2f})"]
             cells += [_number(cell["per_s"])]
