@@ -12,6 +12,7 @@ import mujoco
 import numpy as np
 from jax.typing import ArrayLike
 
+from mjx_arm.render.algebra import fence
 from mjx_arm.render.colour import Colour, geom_colour
 from mjx_arm.render.geoms import (
     GeomGroup,
@@ -268,6 +269,9 @@ def _make_setting(plan: _Plan, look: Look, params: Params) -> Setting:
     if plan.spec.headlight:
         lights.append(-view.basis[:, 2])
     towards = jnp.stack(lights) if lights else jnp.zeros((0, 3), jnp.float32)
+    varies = not plan.spec.view_is_constant
+    if varies:
+        view, towards = fence((view, towards))
     levels = jnp.round(jnp.clip(look.geom_rgb, 0, 1) * 255).astype(jnp.uint32)
     ids = jnp.arange(model.ngeom, dtype=jnp.uint32)
     return Setting(
@@ -277,6 +281,7 @@ def _make_setting(plan: _Plan, look: Look, params: Params) -> Setting:
         sizes=fill(model, plan.spec.varies, params, "geom_size"),
         unlit=pack(levels[:, 0], levels[:, 1], levels[:, 2], ids),
         shown=look.geom_shown,
+        varies=varies,
     )
 
 
@@ -337,7 +342,7 @@ def _render(
     poses = _check_poses(geom_xpos, geom_xmat, spec.model.ngeom)
     look = own
     if camera_pose is not None or any(field in spec.varies for field in LOOK_FIELDS):
-        look = make_look(spec, params, _check_camera_pose(camera_pose))
+        look = fence(make_look(spec, params, _check_camera_pose(camera_pose)))
     setting = _make_setting(plan, look, params)
     skins = plan.moving_skins
     if camera_pose is not None or background is None:

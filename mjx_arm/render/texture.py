@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from mjx_arm.render.algebra import greater, lesser, matmul, matvec
+from mjx_arm.render.algebra import fence, greater, lesser, matmul, matvec
 from mjx_arm.render.colour import Colour
 from mjx_arm.render.geoms import texture_of, why_not_rendered
 from mjx_arm.render.rays import affine
@@ -232,10 +232,14 @@ def _look(
     xpos, xmat = poses.xpos[skin.geom], poses.xmat[skin.geom]
     origin = matvec(xmat.T, setting.view.origin - xpos)
     forms = matmul(xmat.T, setting.view.basis)
-    rays = [affine(form, setting.rays.u, setting.rays.v) for form in forms]
     size = jnp.asarray(setting.sizes[skin.geom], jnp.float32)
     # An infinite plane has the size 0, and repeats its texture by metres.
     inverse = 1 / jnp.where(size > 0, size, jnp.ones_like(size))
+    repeat = jnp.asarray(papers.repeat[skin.material], jnp.float32) / 2
+    repeat = repeat / inverse[:2] if skin.uniform else repeat
+    begin = jnp.where(size[:2] > 0, repeat, -0.5)
+    origin, forms, inverse, repeat, begin = fence((origin, forms, inverse, repeat, begin))
+    rays = [affine(form, setting.rays.u, setting.rays.v) for form in forms]
     point = [o + depth * ray for o, ray in zip(origin, rays, strict=True)]
     unit = [x * k for x, k in zip(point, inverse, strict=True)]
     number = jnp.asarray(papers.texture[skin.material]).astype(jnp.int32)
@@ -245,10 +249,7 @@ def _look(
         s, t, density, face = _on_cube(*((point, 1.0) if skin.uniform else (unit, inverse)))
         start = start + jnp.asarray(atlas.stride)[number] * face
     else:
-        repeat = jnp.asarray(papers.repeat[skin.material], jnp.float32) / 2
-        repeat = repeat / inverse[:2] if skin.uniform else repeat
         place = _on_box(unit, inverse) if skin.box else (unit[0], unit[1], inverse[0], inverse[1])
-        begin = jnp.where(size[:2] > 0, repeat, -0.5)
         s, t = begin[0] + repeat[0] * place[0], begin[1] - repeat[1] * place[1]
         density = greater(repeat[0] * place[2], repeat[1] * place[3])
     parts = _Lookup(s, t, density, normal, start, levels, jnp.asarray(skin.cube))
