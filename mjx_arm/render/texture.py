@@ -24,6 +24,7 @@ import numpy as np
 from mjx_arm.render.algebra import fence, greater, lesser, matmul, matvec
 from mjx_arm.render.colour import Colour
 from mjx_arm.render.geoms import texture_of, why_not_rendered
+from mjx_arm.render.materialize import materialize
 from mjx_arm.render.rays import affine
 from mjx_arm.render.surface import GeomPoses, Setting
 
@@ -331,13 +332,13 @@ def _sample(
     x0, y0 = jnp.floor(x), jnp.floor(y)
     columns = [_wrap(x0.astype(jnp.int32) + i, mask, look.clamped) for i in (0, 1)]
     rows = [_wrap(y0.astype(jnp.int32) + i, mask, look.clamped) << left for i in (0, 1)]
+    places = [(start + row + column).astype(jnp.uint32) for row in rows for column in columns]
+    # A kernel with lookups in memory is not vectorised: it must not have the other arithmetic of
+    # the image in it, before or after, which would take ten times as long.
+    *places, x, y = materialize(*places, x - x0, y - y0)
     texels = jnp.asarray(atlas.texels)
-    corners = [
-        texels.at[start + row + column].get(mode="promise_in_bounds")
-        for row in rows
-        for column in columns
-    ]
-    return _mix(corners, x - x0, y - y0)
+    corners = materialize(*(texels.at[i].get(mode="promise_in_bounds") for i in places))
+    return _mix(list(corners), x, y)
 
 
 def _footprint2(look: _Lookup, depth: jax.Array, setting: Setting) -> jax.Array:
