@@ -1,4 +1,4 @@
-"""Pictures of the scene for the README: our renderer beside MuJoCo's, which needs OpenGL.
+"""Pictures of the scenes: our renderer beside MuJoCo's, which needs OpenGL.
 
 MUJOCO_GL=egl python benchmarks/pictures.py docs
 """
@@ -21,12 +21,23 @@ MOMENTS = (0, 70, 150)
 EDGE = 320
 
 
+# File -> scene and samples of each pixel.
+PICTURES = {"scene.png": ("arm_cube", 1), "desk.png": ("arm_cube_desk", 4)}
+
+
 def main(folder: pathlib.Path) -> None:
-    """Writes `scene.png`, ours above and MuJoCo's below."""
-    env = mjx_arm.make("A", physics="native", observation="packed")
+    """Writes `scene.png` and `desk.png`, ours above and MuJoCo's below."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for file, (scene, samples) in PICTURES.items():
+        imageio.imwrite(folder / file, draw(scene, samples))
+
+
+def draw(scene: str, samples: int) -> np.ndarray:
+    """Moments of an episode by both renderers, one above the other."""
+    env = mjx_arm.make("A", scene=scene, physics="native", observation="packed")
     policy = jax.jit(make_scripted_policy(env))
     step = jax.jit(env.transition)
-    large = mjx_arm.make_renderer(env.scene, size=(EDGE, EDGE), shadows=True)
+    large = mjx_arm.make_renderer(env.scene, size=(EDGE, EDGE), shadows=True, samples=samples)
     model = env.scene.mj_model
     data = mujoco.MjData(model)
     _, state = env.reset(jax.random.key(0))
@@ -41,9 +52,7 @@ def main(folder: pathlib.Path) -> None:
                 renderer.update_scene(data, env.config.cameras[0])
                 theirs.append(renderer.render())
             state, _ = step(state, policy(state))
-    folder.mkdir(parents=True, exist_ok=True)
-    both = [np.concatenate(row, axis=1) for row in (ours, theirs)]
-    imageio.imwrite(folder / "scene.png", np.concatenate(both, axis=0))
+    return np.concatenate([np.concatenate(row, axis=1) for row in (ours, theirs)], axis=0)
 
 
 if __name__ == "__main__":

@@ -13,6 +13,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
+from PIL import Image
 
 import mjx_arm
 
@@ -23,7 +24,7 @@ FINE = 512
 
 
 def main(folder: pathlib.Path) -> None:
-    """Writes `outputs.png`, `background.png` and `inverse_depth.png`."""
+    """Writes `outputs.png`, `background.png`, `inverse_depth.png` and `randomised.png`."""
     folder.mkdir(parents=True, exist_ok=True)
     env = mjx_arm.make("A", observation="state", joint_noise=12.0)
     _, state = jax.jit(env.reset)(jax.random.key(3))
@@ -36,6 +37,7 @@ def main(folder: pathlib.Path) -> None:
         # Without the version of matplotlib, so that the same picture is the same file.
         figure = draw(env, poses)
         figure.savefig(folder / f"{name}.png", dpi=110, metadata={"Software": None})
+    Image.fromarray(_draw_randomised()).save(folder / "randomised.png", optimize=True)
 
 
 def _render(env: mjx_arm.Env, poses: object, **options: object) -> tuple[np.ndarray, np.ndarray]:
@@ -89,6 +91,25 @@ def _draw_inverse_depth(env: mjx_arm.Env, poses: object) -> Figure:
     right.set(title="1 / depth along the row", xlabel="pixel", ylabel="1 / m")
     right.legend(fontsize="small", markerscale=3, loc="upper left", bbox_to_anchor=(1, 1))
     return figure
+
+
+def _draw_randomised() -> np.ndarray:
+    """Eight episodes of the desk scene: small images above larger ones, each in its own pixels."""
+    strips = []
+    for edge, zoom, samples in ((EDGE, 2, 1), (2 * EDGE, 1, 4)):
+        env = mjx_arm.make(
+            "B",
+            scene="arm_cube_desk",
+            physics="native",
+            size=(edge, edge),
+            samples=samples,
+            shadows=True,
+            randomisation="standard",
+        )
+        images, _ = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(12), 8))
+        images = np.asarray(images).repeat(zoom, axis=1).repeat(zoom, axis=2)
+        strips.append(np.concatenate([*images], axis=1))
+    return np.concatenate(strips)
 
 
 def _row(count: int) -> tuple[Figure, np.ndarray]:

@@ -139,6 +139,21 @@ def _time_to_success(content: Any) -> Table:
     return ["learner", goal, "minutes", "steps", "success then", "machine"], rows
 
 
+def _desk(content: Any) -> Table:
+    rows = []
+    for row in content["rows"]:
+        cells = [row["variant"]]
+        for stage in ("render", "step"):
+            if stage not in row:
+                cells += ["not measured"] * 2
+                continue
+            cell = row[stage]
+            cells += [f"{cell['ratio']:.2f} ({cell['least']:.2f} to {cell['most']:.2f})"]
+            cells += [_number(cell["per_s"])]
+        rows.append(cells)
+    return ["variant", "images, of plain", "images/s", "steps, of plain", "steps/s"], rows
+
+
 def _sizes(content: Any) -> list[int]:
     return sorted({row["num_envs"] for row in content["rows"]})
 
@@ -163,6 +178,7 @@ TABLES: dict[str, tuple[str, Callable[[Any], Table]]] = {
     "peer-ratios": ("peers.json", _peer_ratios),
     "profile": ("profile.json", _profile),
     "overhead": ("native_overhead.json", _overhead),
+    "desk": ("desk.json", _desk),
     "cold-start": ("cold_start.json", _seconds),
     "smoke": ("smoke.json", _seconds),
     "time-to-success": ("time_to_success_2_cores.json", _time_to_success),

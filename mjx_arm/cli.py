@@ -33,6 +33,7 @@ from mjx_arm.deploy.robot import Robot
 from mjx_arm.deploy.standin_robot import StandInRobot
 from mjx_arm.deploy.standin_server import StandInProcess
 from mjx_arm.devices import check_device
+from mjx_arm.envs.randomisation import RandomisationConfig
 from mjx_arm.export import check_path, export_policy, image_shape, write_policy
 from mjx_arm.options import (
     Count,
@@ -42,6 +43,7 @@ from mjx_arm.options import (
     flat_annotations,
     flat_names,
     get_option,
+    option_names,
 )
 from mjx_arm.policy import Policy
 from mjx_arm.presets import PRESETS
@@ -254,6 +256,8 @@ class _Try:
       max_steps: iterations until an episode is truncated.
       scene: name or path of a scene to try it in, or `stored` for the one in the agent's file; by
         default the one that it was trained in, as long as that has not changed.
+      randomisation: domain randomisation by one preset, `off`, `tight` or `standard`; by default
+        what it was trained with.
     """
 
     agent: tyro.conf.Positional[pathlib.Path]
@@ -263,13 +267,18 @@ class _Try:
     seed: int = 7
     max_steps: int = 1_000
     scene: str | None = None
+    randomisation: str | None = None
 
     def load(self) -> Agent:
         check_device()
         check_epsilon(self.epsilon)
         check_seed(self.seed)
         options = {"env": self.env, "physics": self.physics}
-        given = {name: value for name, value in options.items() if value is not None}
+        given: dict[str, Any] = {name: x for name, x in options.items() if x is not None}
+        if self.randomisation is not None:
+            # The preset alone, without the ranges that the training changed.
+            given |= dict.fromkeys(option_names(RandomisationConfig))
+            given |= {"randomisation": self.randomisation, "growth_steps": 0}
         return load_agent(self.agent, max_steps=self.max_steps, scene=self.scene, **given)
 
     def key(self) -> jax.Array:

@@ -8,7 +8,7 @@ knows from `Params`, and all other numbers from the model.
 from __future__ import annotations
 
 import difflib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import TypeAlias
 
 import jax
@@ -17,20 +17,46 @@ import mujoco
 import numpy as np
 
 Varies: TypeAlias = Mapping[str, tuple[int, ...]]
-"""Name of a float array of MjModel, or of the headlight -> the ids of its rows that vary."""
+"""Name of a float array of MjModel, or of `EXTRA_FIELDS` -> the ids of its rows that vary."""
 
 Params: TypeAlias = dict[str, jax.Array]
 """The same names -> the values of those rows, `[len(ids), ...] float32`, in the ids' order."""
 
-# The headlight has no row in an array of MjModel. Each of its colours is an array of one row here.
-_HEADLIGHT = {"headlight_ambient": "ambient", "headlight_diffuse": "diffuse"}
+_RGB = int(mujoco.mjtTextureRole.mjTEXROLE_RGB)
+
+# What has no float array in MjModel -> its rows in a model.
+_EXTRA: dict[str, Callable[[mujoco.MjModel], np.ndarray]] = {
+    "headlight_ambient": lambda model: np.asarray(model.vis.headlight.ambient)[None],
+    "headlight_diffuse": lambda model: np.asarray(model.vis.headlight.diffuse)[None],
+    "light_shadow": lambda model: np.asarray(model.light_castshadow, np.float32),
+    "mat_texture": lambda model: np.asarray(model.mat_texid[:, _RGB], np.float32),
+    "image_background": lambda model: np.zeros((1, 3), np.float32),
+    "image_gain": lambda model: np.ones((1, 3), np.float32),
+    "image_noise": lambda model: np.zeros(1, np.float32),
+    "image_blur": lambda model: np.zeros(1, np.float32),
+    "image_seed": lambda model: np.zeros(1, np.float32),
+    "image_delay": lambda model: np.zeros(1, np.float32),
+    "action_delay": lambda model: np.zeros(1, np.float32),
+}
+EXTRA_FIELDS = tuple(_EXTRA)
+"""Names that vary like fields of MjModel, but are none.
+
+- `headlight_ambient`, `headlight_diffuse`: `[1, 3]`, colours of `mj_model.vis.headlight`.
+- `light_shadow`: `[nlight]`, above 0 where a light casts shadows.
+- `mat_texture`: `[nmat]`, id of the texture that colours a material, a whole number.
+- `image_background`: `[1, 3]`, colour in 0..1 of pixels that hit nothing.
+- `image_gain`: `[1, 3]`, factors on red, green and blue: exposure and white balance.
+- `image_noise`: `[1]`, standard deviation of the noise of a pixel, in levels of 255.
+- `image_blur`: `[1]`, share of the blurred image, in 0..1.
+- `image_seed`: `[1]`, any number, whose bits seed the noise of an episode.
+- `image_delay`, `action_delay`: `[1]`, iterations, a whole number.
+"""
 
 
 def check_varies(mj_model: mujoco.MjModel, varies: Varies | None) -> None:
     """Checks that every name and row exists.
 
-    Besides the float arrays of MjModel the names may be `headlight_ambient` and
-    `headlight_diffuse`. These are the colours of `mj_model.vis.headlight`; their only row is 0.
+    Besides the float arrays of MjModel the names may be those of `EXTRA_FIELDS`.
 
     Raises:
       ValueError: a name is not a float array of MjModel, or its rows are not distinct ids of it.
@@ -87,6 +113,28 @@ def own_params(mj_model: mujoco.MjModel, varies: Varies | None) -> Params:
     }
 
 
+def merge_varies(first: Varies, second: Varies) -> Varies:
+    """What varies by either; the rows of the first come first."""
+    merged = {field: tuple(ids) for field, ids in first.items()}
+    for field, ids in second.items():
+        own = merged.get(field, ())
+        merged[field] = (*own, *(row for row in ids if row not in own))
+    return merged
+
+
+def merge_params(
+    first_varies: Varies, first: Params, second_varies: Varies, second: Params
+) -> Params:
+    """The params of `merge_varies`; of a row that both give, the first one's value counts."""
+    merged = dict(first)
+    for field, ids in second_varies.items():
+        own = first_varies.get(field, ())
+        places = [k for k, row in enumerate(ids) if row not in own]
+        values = second[field] if len(places) == len(ids) else second[field][np.asarray(places)]
+        merged[field] = jnp.concatenate([first[field], values]) if own else values
+    return merged
+
+
 def fill(
     mj_model: mujoco.MjModel, varies: Varies | None, params: Params | None, field: str
 ) -> jax.Array | np.ndarray:
@@ -137,8 +185,8 @@ def replace_rows(array: np.ndarray, ids: tuple[int, ...], values: jax.Array) -> 
 
 
 def _values(mj_model: mujoco.MjModel, field: str) -> np.ndarray:
-    if field in _HEADLIGHT:
-        return np.asarray(getattr(mj_model.vis.headlight, _HEADLIGHT[field]))[None]
+    if field in _EXTRA:
+        return _EXTRA[field](mj_model)
     values = getattr(mj_model, field, None)
     if not isinstance(values, np.ndarray) or not np.issubdtype(values.dtype, np.floating):
         near = difflib.get_close_matches(field, _float_fields(mj_model), n=1)
@@ -154,7 +202,7 @@ def _float_fields(mj_model: mujoco.MjModel) -> list[str]:
         if isinstance(values := getattr(mj_model, name, None), np.ndarray)
         and np.issubdtype(values.dtype, np.floating)
     ]
-    return [*found, *_HEADLIGHT]
+    return [*found, *_EXTRA]
 
 
 def _is_row(row: object, count: int) -> bool:

@@ -10,7 +10,7 @@ import jax
 
 from mjx_arm.envs.auto_reset import AutoResetState
 from mjx_arm.envs.env import Env
-from mjx_arm.kinematics import make_kinematics
+from mjx_arm.envs.state import EnvState
 
 Obs = Any
 Frame = Any
@@ -49,15 +49,15 @@ def make_frames(env: Env, storage: str, *, with_features: bool = False) -> Frame
 
     if env.config.observation == "state":
         return Frames(observe, lambda envs, obs: {"features": obs}, features, features)
-    kinematics = make_kinematics(env.scene.mj_model, env.varies)
 
     def render(frame: Frame) -> jax.Array:
-        qpos, params = frame["qpos"], frame["params"]
-        return env.render(qpos, kinematics(qpos, params), params)[0]
+        return env.look(frame["qpos"], frame["params"])[0]
+
+    def state_of(state: EnvState) -> Frame:
+        return {"qpos": env.shown_qpos(state), "params": env.image_params(state.params)}
 
     def encode(envs: AutoResetState, obs: Obs) -> Frame:
-        physics, params = envs.env.physics, envs.env.params
-        frame = {"qpos": physics.qpos, "params": params} if storage == "states" else {"obs": obs}
+        frame = jax.vmap(state_of)(envs.env) if storage == "states" else {"obs": obs}
         if with_features:
             frame["features"] = jax.vmap(env.features)(envs.env)
         return frame

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from typing import Any, Literal
 
+from mjx_arm.envs.randomisation import RandomisationConfig
 from mjx_arm.envs.tasks import TaskConfig, find_task
 from mjx_arm.options import (
     Count,
@@ -40,6 +41,7 @@ class EnvConfig:
       size: height and width of the image, pixels.
       camera: a camera of the scene, or several, whose images are stacked: `[C, H, W]` pixels.
       shadows: hard shadows in the image.
+      samples: rays through each pixel, whose mean smooths the edges: 1, 4 or 16.
       reward: a reward of the task, or `module:function`; empty for the task's first one.
       reward_scale: factor on every term of the reward.
       joint_noise: each joint starts uniformly within this of home, degrees; None for 0 in A and
@@ -53,6 +55,7 @@ class EnvConfig:
       degrees_per_action: how far one action turns a hinge, degrees.
       millimetres_per_action: how far one action moves a slide, mm.
       task_options: options of the task; of the class that the task is registered with.
+      randomise: options of domain randomisation.
     """
 
     env: Literal["A", "B"] = "A"
@@ -63,6 +66,7 @@ class EnvConfig:
     size: Size = (64, 64)
     camera: str | tuple[str, ...] = "front"
     shadows: bool = False
+    samples: Literal[1, 4, 16] = 1
     reward: str = ""
     reward_scale: Positive = 1.0
     joint_noise: NotNegative | None = None
@@ -72,6 +76,7 @@ class EnvConfig:
     degrees_per_action: Positive = 1.0
     millimetres_per_action: Positive = 5.0
     task_options: TaskConfig = dataclasses.field(default_factory=find_task("lift").config)
+    randomise: RandomisationConfig = dataclasses.field(default_factory=RandomisationConfig)
 
     def check(self) -> None:
         """Refuses options that do not fit together."""

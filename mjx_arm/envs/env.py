@@ -16,6 +16,7 @@ import numpy as np
 from mjx_arm.envs.arm import Arm, apply_action, arm_feature_scales, arm_features, resolve_arm
 from mjx_arm.envs.collision import Collision, make_self_collision
 from mjx_arm.envs.config import EnvConfig, env_config
+from mjx_arm.envs.randomisation import Randomiser, image_varies, make_randomiser, select_rows
 from mjx_arm.envs.starts import StartSampler
 from mjx_arm.envs.state import EnvState, Observation, Placement, Snapshot, Transition
 from mjx_arm.envs.tasks import find_task
@@ -25,11 +26,15 @@ from mjx_arm.options import check_name
 from mjx_arm.physics import Physics, make_physics
 from mjx_arm.references import is_reference, load_reference, reference_to
 from mjx_arm.render import make_renderer, rgb, segmentation
+from mjx_arm.render.materialize import materialize
+from mjx_arm.render.sensor import entropy_of, make_sensor
 from mjx_arm.scene import Scene, SceneSource, compile_scene, load_scene
-from mjx_arm.varies import Params, Varies, check_varies
+from mjx_arm.varies import Params, Varies, check_varies, merge_params, merge_varies
 
 # `(qpos, poses, params)` -> packed pixels, and with depth the z-depth.
 Camera = Callable[[jax.Array, Poses, Params], tuple[jax.Array, ...]]
+# What splits the key of a start is older than randomisation, which may not change it.
+_RANDOMISATION = 17
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -47,6 +52,9 @@ class Env:
       collision: whether the arm is free of itself, its base and the ground.
       link_kinematics: poses of the geoms of `collision` alone, at a `qpos` and params.
       varies: which rows of the model's fields vary by episode.
+      randomiser: samples what varies beside the task's own params.
+      image_varies: the part of `varies` that images are made from.
+      image_kinematics: poses at a `qpos` and the params of `image_varies`.
       cameras: renders the image of each camera.
     """
 
@@ -60,6 +68,9 @@ class Env:
     collision: Collision
     link_kinematics: Kinematics
     varies: Varies
+    randomiser: Randomiser
+    image_varies: Varies
+    image_kinematics: Kinematics
     cameras: tuple[Camera, ...]
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -104,7 +115,7 @@ class Env:
             placement = jax.tree.map(
                 lambda new, old: jnp.where(state.success, new, old), placement, state.placement
             )
-        return self._start(start_key, placement, wanted)
+        return self._start(start_key, placement, wanted, state.past.get("age"))
 
     def step(
         self, key: jax.Array, state: EnvState, action: jax.Array | int
@@ -139,17 +150,17 @@ class Env:
     def transition(self, state: EnvState, action: jax.Array | int) -> tuple[EnvState, Transition]:
         """Advances by one iteration without rendering an observation; see `step`."""
         self._check_action(action)
-        config = self.config
+        config, task = self.config, self._task_of(self.varies, state.params)
         action = jnp.asarray(action, jnp.int32)
-        wanted = apply_action(
-            self.arm, state.ctrl, action, config.degrees_per_action, config.millimetres_per_action
-        )
+        wanted = self._commanded(state, action)
         blocked = self._is_blocked(state, wanted)
         ctrl = jnp.where(blocked, state.ctrl, wanted)
         physics = self.physics.step(state.physics, ctrl, state.params)
         after = dataclasses.replace(state, physics=physics, ctrl=ctrl, step=state.step + 1)
-        then = Snapshot(after, self.task.measure(after))
-        terms = self.reward(Snapshot(state, self.task.measure(state)), then, action)
+        if state.past:
+            after = dataclasses.replace(after, past=_advance_past(state, action))
+        then = Snapshot(after, task.measure(after))
+        terms = self.reward(Snapshot(state, task.measure(state)), then, action)
         terms = {name: config.reward_scale * term for name, term in terms.items()}
         success = then.measured["success"]
         info = {
@@ -179,7 +190,10 @@ class Env:
         kind = self.config.observation
         if kind == "state":
             return self.features(state)
-        image = self.render(state.physics.qpos, state.physics.poses, state.params)
+        if self.randomiser:
+            image = self.look(self.shown_qpos(state), self.image_params(state.params))
+        else:
+            image = self.render(state.physics.qpos, state.physics.poses, state.params)
         if kind == "rgb":
             return rgb(image[0])
         if kind == "segmentation":
@@ -190,6 +204,34 @@ class Env:
 
     def render(self, qpos: jax.Array, poses: Poses, params: Params) -> tuple[jax.Array, ...]:
         """Packed pixels `[H, W] uint32`, and for `"rgbd"` the depth; see `observe`."""
+        return self._shoot(qpos, poses, self.image_params(params))
+
+    def look(self, qpos: jax.Array, params: Params) -> tuple[jax.Array, ...]:
+        """The image of a state and the params of `image_varies`, which the replay stores.
+
+        With randomisation, whoever renders the same two gets the same image to the bit.
+        """
+        poses = self.image_kinematics(qpos, params)
+        if self.randomiser:
+            # Or XLA on CPU would compute poses in each kernel, and round them in each its own way.
+            poses = jax.tree.map(lambda x: jax.lax.reduce_precision(x, 8, 23), poses)
+        return self._shoot(qpos, poses, params)
+
+    def image_params(self, params: Params) -> Params:
+        """Of the params of an episode those of `image_varies`."""
+        return select_rows(self.varies, params, self.image_varies) if self.randomiser else params
+
+    def shown_qpos(self, state: EnvState) -> jax.Array:
+        """The `qpos [nq] float32` that the image of a state shows: an earlier one, if delayed."""
+        if "qpos" not in state.past:
+            return state.physics.qpos
+        delay = state.params["image_delay"][0]
+        shown = state.physics.qpos
+        for steps, earlier in enumerate(state.past["qpos"], start=1):
+            shown = jnp.where(delay >= steps, earlier, shown)
+        return shown
+
+    def _shoot(self, qpos: jax.Array, poses: Poses, params: Params) -> tuple[jax.Array, ...]:
         images = [camera(qpos, poses, params) for camera in self.cameras]
         if len(images) == 1:
             return images[0]
@@ -198,22 +240,33 @@ class Env:
     def with_cameras(self, **options: Any) -> Env:
         """The same environment with other images, such as `size=(256, 256), shadows=True`."""
         config = dataclasses.replace(self.config, **options)
-        cameras = [_make_camera(self.scene, name, config, self.varies) for name in config.cameras]
-        return dataclasses.replace(self, config=config, cameras=tuple(cameras))
+        cameras = _make_cameras(self.scene, config, self.image_varies)
+        return dataclasses.replace(self, config=config, cameras=cameras)
 
     def features(self, state: EnvState) -> jax.Array:
         """State features, `[F] float32`: those of `arm_features`, then the task's."""
         site = state.physics.poses.site_xpos[self.arm.grasp_site]
         arm = arm_features(self.arm, state.physics.qpos, state.ctrl, site)
-        return jnp.concatenate([arm, self.task.features(state)])
+        task = self._task_of(self.varies, state.params)
+        return jnp.concatenate([arm, task.features(state)])
 
     def _sample_placement(self, key: jax.Array) -> Placement:
         if self.config.placed == "fixed":
             return self.task.fixed_placement()
         return self.task.sample_placement(key)
 
-    def _start(self, key: jax.Array, placement: Placement, wanted: jax.Array | bool) -> EnvState:
-        qpos, ctrl, params, samples = self.starts.sample(key, placement, wanted)
+    def _start(
+        self,
+        key: jax.Array,
+        placement: Placement,
+        wanted: jax.Array | bool,
+        age: jax.Array | None = None,
+    ) -> EnvState:
+        starts = self.starts
+        if self.randomiser:
+            age = jnp.zeros((), jnp.int32) if age is None else age
+            starts = self._randomised_starts(jax.random.fold_in(key, _RANDOMISATION), age)
+        qpos, ctrl, params, samples = starts.sample(key, placement, wanted)
         return EnvState(
             physics=self.physics.init(qpos, ctrl, params),
             ctrl=ctrl,
@@ -222,7 +275,52 @@ class Env:
             placement=placement,
             success=jnp.zeros((), jnp.bool_),
             start_samples=samples,
+            past=self._first_past(qpos, age),
         )
+
+    def _randomised_starts(self, key: jax.Array, age: jax.Array) -> StartSampler:
+        """The sampler of starts with what else varies. Consumes the key."""
+        randomiser, own = self.randomiser, self.task.varies
+        growth = randomiser.growth(age) if randomiser.growth_steps else 1.0
+        params = randomiser.sample(key, growth)
+        return dataclasses.replace(
+            self.starts,
+            task=self._task_of(randomiser.varies, params),
+            add_params=lambda given: merge_params(own, given, randomiser.varies, params),
+        )
+
+    def _first_past(self, qpos: jax.Array, age: jax.Array | None) -> dict[str, jax.Array]:
+        """`EnvState.past` at the start of an episode, as if the arm had long been there."""
+        past, randomiser = {}, self.randomiser
+        if "image_delay" in randomiser.varies:
+            past["qpos"] = jnp.tile(qpos, (randomiser.ranges.image_delay, 1))
+        if "action_delay" in randomiser.varies:
+            past["actions"] = jnp.full((randomiser.ranges.action_delay,), -1, jnp.int32)
+        if randomiser.growth_steps:
+            assert age is not None
+            past["age"] = age
+        return past
+
+    def _task_of(self, varies: Varies, params: Params) -> Task:
+        """The task, with the sizes that its objects have in an episode."""
+        resized = getattr(self.task, "with_params", None)
+        if resized is None or not self.randomiser.resizes:
+            return self.task
+        task: Task = resized(varies, params)
+        return task
+
+    def _commanded(self, state: EnvState, action: jax.Array) -> jax.Array:
+        """The targets `[nu] float32` that an action asks for, or a delayed one before it."""
+        config = self.config
+        delayed = "actions" in state.past
+        if delayed:
+            delay = state.params["action_delay"][0]
+            for steps, earlier in enumerate(state.past["actions"], start=1):
+                action = jnp.where(delay >= steps, earlier, action)
+        wanted = apply_action(
+            self.arm, state.ctrl, action, config.degrees_per_action, config.millimetres_per_action
+        )
+        return jnp.where(action < 0, state.ctrl, wanted) if delayed else wanted
 
     def _is_blocked(self, state: EnvState, ctrl: jax.Array) -> jax.Array:
         """Whether a command would take the arm into itself, its base or the ground: `[] bool`."""
@@ -274,13 +372,18 @@ def make_env(config: EnvConfig, *, reward: Reward | None = None, scene: Scene | 
     scene = load_scene(config.scene_name) if scene is None else scene
     arm = resolve_arm(scene)
     task = find_task(config.task).make(config.task_options, scene, arm)
-    model, varies = scene.mj_model, task.varies
-    check_varies(model, varies)
+    model = scene.mj_model
+    check_varies(model, task.varies)
+    randomiser = make_randomiser(config.randomise, model, config.cameras)
+    varies = merge_varies(task.varies, randomiser.varies) if randomiser else task.varies
+    shown = image_varies(model, varies) if randomiser else varies
     kinematics = make_kinematics(model, varies)
-    # Geoms whose place varies by episode mark a place; the arm may pass through them.
-    marks = varies.get("geom_pos", ())
+    # Geoms whose place the task varies mark a place; the arm may pass through them.
+    marks = task.varies.get("geom_pos", ())
+    largest = randomiser.ranges.cube_size[1]
+    obstacles = [dataclasses.replace(x, radius=x.radius * largest) for x in task.obstacles]
     collision = make_self_collision(model, ignored=marks, home=arm.home_qpos)
-    around = make_self_collision(model, obstacles=task.obstacles, ignored=marks, home=arm.home_qpos)
+    around = make_self_collision(model, obstacles=obstacles, ignored=marks, home=arm.home_qpos)
     return Env(
         config=config,
         scene=scene,
@@ -298,7 +401,10 @@ def make_env(config: EnvConfig, *, reward: Reward | None = None, scene: Scene | 
         collision=collision,
         link_kinematics=make_kinematics(model, varies, collision.geoms.tolist()),
         varies=varies,
-        cameras=tuple(_make_camera(scene, name, config, varies) for name in config.cameras),
+        randomiser=randomiser,
+        image_varies=shown,
+        image_kinematics=make_kinematics(model, shown) if randomiser else kinematics,
+        cameras=_make_cameras(scene, config, shown),
     )
 
 
@@ -316,23 +422,48 @@ def _find_reward(config: EnvConfig, task: Task) -> Reward:
     return task.rewards[name]
 
 
-def _make_camera(scene: Scene, name: str, config: EnvConfig, varies: Varies) -> Camera:
+def _advance_past(state: EnvState, action: jax.Array) -> dict[str, jax.Array]:
+    """`EnvState.past` one step later: the newest first, the oldest dropped."""
+    past = dict(state.past)
+    if "qpos" in past:
+        past["qpos"] = jnp.concatenate([state.physics.qpos[None], past["qpos"][:-1]])
+    if "actions" in past:
+        past["actions"] = jnp.concatenate([action[None], past["actions"][:-1]])
+    if "age" in past:
+        past["age"] = past["age"] + 1
+    return past
+
+
+def _make_cameras(scene: Scene, config: EnvConfig, varies: Varies) -> tuple[Camera, ...]:
+    return tuple(
+        _make_camera(scene, name, number, config, varies)
+        for number, name in enumerate(config.cameras)
+    )
+
+
+def _make_camera(scene: Scene, name: str, number: int, config: EnvConfig, varies: Varies) -> Camera:
     """Renders what one camera sees; a camera on a moving body is moved with it."""
     render: Any = make_renderer(
         scene,
         camera=name,
         size=config.size,
         shadows=config.shadows,
+        samples=config.samples,
         depth=config.observation == "rgbd",
         varies=varies,
     )
     pose = None
     if scene.mj_model.body_weldid[scene.mj_model.camera(name).bodyid[0]] != 0:
         pose = make_camera_pose(scene.mj_model, name, varies)
+    sensor = make_sensor(varies)
 
     def camera(qpos: jax.Array, poses: Poses, params: Params) -> tuple[jax.Array, ...]:
         moved = None if pose is None else pose(qpos, params)
         image = render(poses.geom_xpos, poses.geom_xmat, params, moved)
-        return image if isinstance(image, tuple) else (image,)
+        image = image if isinstance(image, tuple) else (image,)
+        if sensor is None:
+            return image
+        packed = sensor(image[0], params, entropy_of(qpos, number))
+        return materialize(packed, *image[1:])
 
     return camera

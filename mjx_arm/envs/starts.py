@@ -36,6 +36,7 @@ class StartSampler:
       collision: whether the arm is free of itself, its base, the ground and the task's objects.
       kinematics: poses of a `qpos`.
       config: how joints and objects vary.
+      add_params: adds to the params of the task what else varies in the episode.
     """
 
     arm: Arm
@@ -43,6 +44,7 @@ class StartSampler:
     collision: Collision
     kinematics: Callable[[jax.Array, Params], Poses]
     config: EnvConfig
+    add_params: Callable[[Params], Params] = lambda params: params
 
     def sample(
         self, key: jax.Array, placement: Placement, wanted: jax.Array | bool = True
@@ -92,4 +94,5 @@ class StartSampler:
     ) -> tuple[jax.Array, jax.Array, Params]:
         qpos = jnp.asarray(self.arm.home_qpos).at[self.arm.qpos].set(joints)
         ctrl = jnp.asarray(self.arm.home_ctrl).at[self.arm.ctrl].set(joints)
-        return self.task.start(qpos, ctrl, placement)
+        qpos, ctrl, params = self.task.start(qpos, ctrl, placement)
+        return qpos, ctrl, self.add_params(params)

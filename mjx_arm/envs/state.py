@@ -27,6 +27,10 @@ class EnvState:
       placement: where the episode put the task's objects. Outlives the episode.
       success: `[] bool`, the last step ended in success. Outlives the episode.
       start_samples: `[] int32`, joint angles sampled for the start, the accepted ones included.
+      past: what delays and growing ranges need of earlier steps; empty without them. `qpos`
+        `[D, nq] float32`, the last states, and `actions` `[E] int32`, the last actions, -1 before
+        the first, both newest first; `age` `[] int32`, iterations since the environment was made,
+        which outlives the episode.
     """
 
     physics: PhysicsState
@@ -36,6 +40,7 @@ class EnvState:
     placement: Placement
     success: jax.Array
     start_samples: jax.Array
+    past: dict[str, jax.Array] = flax.struct.field(default_factory=dict)
 
 
 @flax.struct.dataclass

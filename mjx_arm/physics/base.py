@@ -49,11 +49,14 @@ FIELDS = DERIVING_FIELDS | frozenset(
         "pair_solref",
     }
 )
-# Fields that change the image alone begin with one of these.
-_IMAGE_PREFIXES = (
+# Fields that physics does not read begin with one of these: they change the image, or the delay of
+# actions, which the environment sees to.
+_OTHERS_PREFIXES = (
+    "action_delay",
     "cam_",
     "geom_rgba",
     "headlight_",
+    "image_",
     "light_",
     "mat_",
     "site_rgba",
@@ -182,7 +185,7 @@ def physics_varies(mj_model: mujoco.MjModel, varies: Varies | None) -> Varies:
     check_varies(mj_model, varies)
     read = {}
     for field in sorted(varies):
-        if field.startswith(_IMAGE_PREFIXES):
+        if field.startswith(_OTHERS_PREFIXES):
             continue
         if field not in FIELDS:
             raise ValueError(

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from typing import TypeVar
+
 import jax
 import jax.numpy as jnp
+
+T = TypeVar("T")
 
 
 def matvec(matrix: jax.Array, vector: jax.Array) -> jax.Array:
@@ -14,6 +18,21 @@ def matvec(matrix: jax.Array, vector: jax.Array) -> jax.Array:
 def matmul(left: jax.Array, right: jax.Array) -> jax.Array:
     """Returns `left [m, k]` times `right [k, n]`, as `matvec`."""
     return jnp.sum(left[:, :, None] * right[None, :, :], axis=1)
+
+
+def fence(tree: T) -> T:
+    """Returns the floats of a tree unchanged, but computed before anything that reads them.
+
+    XLA on CPU would compute what is one number a frame again at every pixel, in every kernel. It
+    does not fuse what is rounded, even to the precision that it has.
+    """
+
+    def hold(x: jax.Array) -> jax.Array:
+        floats = jnp.issubdtype(x.dtype, jnp.floating)
+        return jax.lax.reduce_precision(x, 8, 23) if floats else x
+
+    fenced: T = jax.tree.map(hold, tree)
+    return fenced
 
 
 def lesser(a: jax.Array, b: jax.Array) -> jax.Array:

@@ -1,20 +1,17 @@
 """The surface's own colour at every pixel: the stage between casting and shading.
 
-A stage is a function of the type `ColourStage`. The plain one returns the colours of the geoms,
-which casting has carried along. A texture would be another stage, which looks its colour up at the
-point that it computes from the depth, the rays and the pose of the geom.
+Casting has carried the colours of the geoms along. Textures multiply them; see `texture.py`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from mjx_arm.render.packing import unpack
-from mjx_arm.render.surface import GeomPoses, Setting, Surface
+from mjx_arm.render.surface import Surface
 
 
 class Colour(NamedTuple):
@@ -33,13 +30,8 @@ class Colour(NamedTuple):
     geom: jax.Array
 
 
-ColourStage: TypeAlias = Callable[[Surface, jax.Array, Setting, GeomPoses], Colour]
-"""`(surface, depth, setting, poses) -> Colour`; depth is `[H, W] float32`, z-depth in m."""
-
-
-def geom_colour(surface: Surface, depth: jax.Array, setting: Setting, poses: GeomPoses) -> Colour:
+def geom_colour(surface: Surface) -> Colour:
     """Returns the colour of the geom at each pixel."""
-    del depth, setting, poses
     *channels, geom = unpack(surface.unlit)
     red, green, blue = (channel.astype(jnp.float32) for channel in channels)
     return Colour(red, green, blue, geom)

@@ -29,6 +29,10 @@ _UNSUPPORTED = {
     "skin": mujoco.mjtObj.mjOBJ_SKIN,
 }
 
+# Only these have textures that are mapped as MuJoCo maps them.
+TEXTURED_KINDS = ("plane", "box")
+RGB_ROLE = int(mujoco.mjtTextureRole.mjTEXROLE_RGB)
+
 # MuJoCo takes this colour for "none given".
 DEFAULT_RGBA = np.asarray([0.5, 0.5, 0.5, 1.0], np.float32)
 
@@ -56,8 +60,9 @@ def validate_geoms(mj_model: mujoco.MjModel, varies: Varies | None = None) -> No
       varies: rows of the model that vary by episode.
 
     Raises:
-      ValueError: a visible geom is no plane, box, sphere, capsule or cylinder, or has a texture; a
-        spatial tendon, flex or skin is visible; or there are more than 255 geoms.
+      ValueError: a visible geom is no plane, box, sphere, capsule or cylinder, or has a texture
+        that cannot be rendered; a spatial tendon, flex or skin is visible; or there are more than
+        255 geoms.
     """
     if mj_model.ngeom > MAX_GEOMS:
         raise ValueError(
@@ -72,13 +77,49 @@ def validate_geoms(mj_model: mujoco.MjModel, varies: Varies | None = None) -> No
                 f"geom {_label(mj_model, geom)} is of type {kind}, which cannot be rendered; "
                 f"supported are {supported}, and geoms of group 3 or higher are not rendered"
             )
-        material = mj_model.geom_matid[geom]
-        if material >= 0 and np.any(mj_model.mat_texid[material] >= 0):
-            raise ValueError(
-                f"geom {_label(mj_model, geom)} has a texture by its material "
-                f"{mj_model.material(material).name!r}; supported are plain rgba colours"
-            )
+        _validate_texture(mj_model, geom)
     _validate_others(mj_model)
+
+
+def _validate_texture(mj_model: mujoco.MjModel, geom: int) -> None:
+    """Refuses a geom whose material has a texture that the renderer cannot show."""
+    material = int(mj_model.geom_matid[geom])
+    roles = np.flatnonzero(mj_model.mat_texid[material] >= 0) if material >= 0 else np.zeros(0)
+    if not roles.size:
+        return
+    where = (
+        f"geom {_label(mj_model, geom)} has a texture by its material "
+        f"{mj_model.material(material).name!r}"
+    )
+    if roles.tolist() != [RGB_ROLE]:
+        raise ValueError(f"{where} in another role than 'rgb'; supported are textures of colour")
+    if SUPPORTED_TYPES[int(mj_model.geom_type[geom])] not in TEXTURED_KINDS:
+        raise ValueError(f"{where}; supported are textures of planes and boxes")
+    reason = why_not_rendered(mj_model, texture_of(mj_model, geom))
+    if reason:
+        raise ValueError(f"{where} that {reason}")
+
+
+def texture_of(mj_model: mujoco.MjModel, geom: int) -> int:
+    """Id of the texture that colours a geom, -1 for none."""
+    material = int(mj_model.geom_matid[geom])
+    return int(mj_model.mat_texid[material, RGB_ROLE]) if material >= 0 else -1
+
+
+def why_not_rendered(mj_model: mujoco.MjModel, texture: int) -> str:
+    """What keeps a texture from being rendered, such as "is 12 by 7 pixels"; empty for nothing."""
+    width, height, channels = (
+        int(array[texture])
+        for array in (mj_model.tex_width, mj_model.tex_height, mj_model.tex_nchannel)
+    )
+    if int(mj_model.tex_type[texture]) == int(mujoco.mjtTexture.mjTEXTURE_SKYBOX):
+        return "is a skybox"
+    if channels not in (3, 4):
+        return f"has {channels} channels; it must have 3 or 4"
+    cube = int(mj_model.tex_type[texture]) == int(mujoco.mjtTexture.mjTEXTURE_CUBE)
+    if width & (width - 1) or (height != width and not (cube and height == 6 * width)):
+        return f"is {width} by {height} pixels; its edges must be equal, and a power of two"
+    return ""
 
 
 def _validate_others(mj_model: mujoco.MjModel) -> None:
@@ -121,13 +162,15 @@ def visible_geoms(mj_model: mujoco.MjModel, varies: Varies | None = None) -> np.
 def static_geoms(mj_model: mujoco.MjModel, varies: Varies | None = None) -> np.ndarray:
     """Whether each geom is the same in all frames, `[ngeom] bool`.
 
-    These are the geoms that are welded to the world, unless their pose, size or colour varies by
-    episode. Geoms of mocap bodies are not static.
+    These are the geoms that are welded to the world, unless their pose, size, colour or texture
+    varies by episode. Geoms of mocap bodies are not static.
     """
     static = np.asarray(mj_model.body_weldid[mj_model.geom_bodyid] == 0)
     static &= ~varying_bodies(mj_model, varies)[mj_model.geom_bodyid]
     for field in ("geom_pos", "geom_quat", "geom_size", "geom_rgba"):
         static[list((varies or {}).get(field, ()))] = False
+    for field in ("mat_texture", "mat_texrepeat"):
+        static[np.isin(mj_model.geom_matid, (varies or {}).get(field, ()))] = False
     return static
 
 

@@ -12,7 +12,8 @@ import mujoco
 import numpy as np
 from jax.typing import ArrayLike
 
-from mjx_arm.render.colour import ColourStage, geom_colour
+from mjx_arm.render.algebra import fence
+from mjx_arm.render.colour import Colour, geom_colour
 from mjx_arm.render.geoms import (
     GeomGroup,
     geom_groups,
@@ -30,6 +31,7 @@ from mjx_arm.render.look import (
 )
 from mjx_arm.render.materialize import materialize
 from mjx_arm.render.packing import pack
+from mjx_arm.render.pixels import average
 from mjx_arm.render.rays import make_rays, make_view
 from mjx_arm.render.shading import incidence, shade
 from mjx_arm.render.surface import (
@@ -40,10 +42,14 @@ from mjx_arm.render.surface import (
     covered,
     empty_surface,
 )
+from mjx_arm.render.texture import Atlas, Papers, Skin, apply_textures, make_atlas, make_skins
 from mjx_arm.varies import Params, Varies, check_params, check_varies, fill, own_params
 
 # Fields that would change the image, but that the renderer takes from the model only.
 _CONSTANT_FIELDS = ("mat_rgba", "cam_sensorsize", "cam_intrinsic")
+_OTHER_FIELDS = ("geom_size", "light_shadow", "mat_texture", "mat_texrepeat")
+# Rays through a pixel -> rays side by side in it.
+_SAMPLES = {1: 1, 4: 2, 16: 4}
 
 
 class HasModel(Protocol):
@@ -90,6 +96,7 @@ def make_renderer(
     camera: str = ...,
     size: tuple[int, int] = ...,
     shadows: bool = ...,
+    samples: int = ...,
     depth: Literal[False] = ...,
     varies: Varies | None = ...,
 ) -> Render: ...
@@ -102,6 +109,7 @@ def make_renderer(
     camera: str = ...,
     size: tuple[int, int] = ...,
     shadows: bool = ...,
+    samples: int = ...,
     depth: Literal[True],
     varies: Varies | None = ...,
 ) -> RenderWithDepth: ...
@@ -114,6 +122,7 @@ def make_renderer(
     camera: str = ...,
     size: tuple[int, int] = ...,
     shadows: bool = ...,
+    samples: int = ...,
     depth: bool = ...,
     varies: Varies | None = ...,
 ) -> Render | RenderWithDepth: ...
@@ -125,6 +134,7 @@ def make_renderer(
     camera: str = "front",
     size: tuple[int, int] = (64, 64),
     shadows: bool = False,
+    samples: int = 1,
     depth: bool = False,
     varies: Varies | None = None,
 ) -> Render | RenderWithDepth:
@@ -143,26 +153,29 @@ def make_renderer(
     It returns packed pixels, `[H, W] uint32`: see `rgb` and `segmentation`.
 
     What varies: of `varies` and `params` the renderer reads `geom_rgba`, `geom_size`, `light_dir`
-    (any length but zero), `light_diffuse`, `light_ambient`, `cam_pos`, `cam_quat`, `cam_fovy`, and
-    `headlight_ambient` and `headlight_diffuse`, which have the one row 0. Poses of geoms that vary
-    reach it through `geom_xpos` and `geom_xmat`.
+    (any length but zero), `light_diffuse`, `light_ambient`, `light_shadow`, `cam_pos`, `cam_quat`,
+    `cam_fovy`, `mat_texture`, `mat_texrepeat`, and `headlight_ambient` and `headlight_diffuse`,
+    which have the one row 0; see `mjx_arm.varies.EXTRA_FIELDS`. Poses of geoms that vary reach it
+    through `geom_xpos` and `geom_xmat`.
 
     Speed: geoms that are the same in all frames are cast once, when the renderer is made. If the
     camera or the direction of a light varies, or `camera_pose` is given, all geoms are cast in
     every frame.
 
     The image follows MuJoCo's own renderer. It shows geoms of the groups 0, 1 and 2 with alpha
-    above zero, all opaque, in plain colours. Light is the sum of ambient light, any number of
-    directional lights, and the headlight; pixels that hit nothing are black. A shadow removes the
-    diffuse part of its light. Not rendered are sites, rangefinder rays, specular light, emission,
-    reflections, the skybox, geoms around the camera, and planes from behind. There is no near or
-    far clipping.
+    above zero, all opaque, in plain colours; planes and boxes may have 2D and cube textures. Light
+    is the sum of ambient light, any number of directional lights, and the headlight; pixels that
+    hit nothing are black. A shadow removes the diffuse part of its light. Not rendered are sites,
+    rangefinder rays, specular light, emission, reflections, the skybox, geoms around the camera,
+    and planes from behind. There is no near or far clipping.
 
     Args:
       scene: an `MjModel`, or an object with one as `mj_model`.
       camera: name of a perspective camera of mode `fixed`, on any body.
       size: height and width of the image, pixels.
       shadows: whether directional lights cast hard shadows, where the model's `castshadow` says so.
+      samples: rays through each pixel: 1, 4 or 16. Colours are their mean; the geom id and the
+        depth are those of one of them, since a mean would be neither.
       depth: whether to return a second array: z-depth along the optical axis, `[H, W] float32`,
         m, infinite where nothing is hit.
       varies: rows of the model that vary by episode. Fields that do not concern the image are
@@ -174,11 +187,13 @@ def make_renderer(
         wrong names or shapes, and if a camera on a moving body gets no `camera_pose`.
     """
     _validate_size(size)
+    if isinstance(samples, bool) or samples not in _SAMPLES:
+        raise ValueError(f"samples must be 1, 4 or 16 rays through a pixel, got {samples!r}")
     model = scene if isinstance(scene, mujoco.MjModel) else scene.mj_model
     _validate_varies(model, varies)
     validate_geoms(model, varies)
     spec = make_look_spec(model, camera, varies or {})
-    plan = _make_plan(spec, size, shadows)
+    plan = _make_plan(spec, size, shadows, _SAMPLES[samples])
     with jax.ensure_compile_time_eval():
         own = make_look(spec, own_params(model, varies), None)
         background = _cast_background(plan, own) if spec.view_is_constant else None
@@ -197,41 +212,51 @@ class _Plan:
 
     Attributes:
       spec: camera, lights, model and what varies.
-      size: height and width, pixels.
+      size: height and width, in rays.
+      edge: rays side by side in a pixel.
       still: visible geoms that are the same in all frames.
       still_poses: poses of all geoms, valid for those.
       still_mask: `[ngeom] bool`, which geoms these are.
       moving: the other visible geoms.
       shadows: indices of the lights that cast shadows, in the order of the look.
-      colour: the stage that colours the surface.
+      still_skins: the textured geoms among the still ones.
+      moving_skins: those among the others.
+      atlas: the textures, None where no geom has one.
     """
 
     spec: LookSpec
     size: tuple[int, int]
+    edge: int
     still: list[GeomGroup]
     still_poses: GeomPoses
     still_mask: np.ndarray
     moving: list[GeomGroup]
     shadows: tuple[int, ...]
-    colour: ColourStage
+    still_skins: list[Skin]
+    moving_skins: list[Skin]
+    atlas: Atlas | None
 
 
-def _make_plan(spec: LookSpec, size: tuple[int, int], shadows: bool) -> _Plan:
+def _make_plan(spec: LookSpec, size: tuple[int, int], shadows: bool, edge: int) -> _Plan:
     model = spec.model
     visible, static = visible_geoms(model, spec.varies), static_geoms(model, spec.varies)
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     with jax.ensure_compile_time_eval():
         still_poses = _check_poses(data.geom_xpos, data.geom_xmat, model.ngeom)
+    still_skins, moving_skins = (make_skins(model, visible & which) for which in (static, ~static))
     return _Plan(
         spec=spec,
-        size=size,
+        size=(size[0] * edge, size[1] * edge),
+        edge=edge,
         still=geom_groups(model, visible & static),
         still_poses=still_poses,
         still_mask=visible & static,
         moving=geom_groups(model, visible & ~static),
         shadows=tuple(i for i, casts in enumerate(spec.casts_shadow()) if casts and shadows),
-        colour=geom_colour,
+        still_skins=still_skins,
+        moving_skins=moving_skins,
+        atlas=make_atlas(model) if still_skins or moving_skins else None,
     )
 
 
@@ -244,6 +269,9 @@ def _make_setting(plan: _Plan, look: Look, params: Params) -> Setting:
     if plan.spec.headlight:
         lights.append(-view.basis[:, 2])
     towards = jnp.stack(lights) if lights else jnp.zeros((0, 3), jnp.float32)
+    varies = not plan.spec.view_is_constant
+    if varies:
+        view, towards = fence((view, towards))
     levels = jnp.round(jnp.clip(look.geom_rgb, 0, 1) * 255).astype(jnp.uint32)
     ids = jnp.arange(model.ngeom, dtype=jnp.uint32)
     return Setting(
@@ -253,12 +281,49 @@ def _make_setting(plan: _Plan, look: Look, params: Params) -> Setting:
         sizes=fill(model, plan.spec.varies, params, "geom_size"),
         unlit=pack(levels[:, 0], levels[:, 1], levels[:, 2], ids),
         shown=look.geom_shown,
+        varies=varies,
     )
 
 
 def _background(plan: _Plan, look: Look) -> Surface:
-    setting = _make_setting(plan, look, own_params(plan.spec.model, plan.spec.varies))
-    return cast(plan.still, plan.still_poses, setting, empty_surface(setting))
+    """The geoms that are the same in all frames, with their textures in their own colours."""
+    own = own_params(plan.spec.model, plan.spec.varies)
+    setting = _make_setting(plan, look, own)
+    surface = cast(plan.still, plan.still_poses, setting, empty_surface(setting))
+    if not plan.still_skins:
+        return surface
+    depth, _ = _depth(surface)
+    colour = geom_colour(surface)
+    colour = _paint(plan, plan.still_skins, colour, depth, setting, plan.still_poses, own)
+    channels = (colour.red, colour.green, colour.blue)
+    levels = [jnp.round(channel).astype(jnp.uint32) for channel in channels]
+    return surface._replace(unlit=pack(levels[0], levels[1], levels[2], colour.geom))
+
+
+def _depth(surface: Surface) -> tuple[jax.Array, jax.Array]:
+    """z-depth `[H, W] float32`, m, 1 where nothing is hit; and whether something is."""
+    hit = surface.w > 0
+    return 1 / jnp.where(hit, surface.w, jnp.ones_like(surface.w)), hit
+
+
+def _paint(
+    plan: _Plan,
+    skins: list[Skin],
+    colour: Colour,
+    depth: jax.Array,
+    setting: Setting,
+    poses: GeomPoses,
+    params: Params,
+) -> Colour:
+    """The colours with the textures of `skins`."""
+    if not skins:
+        return colour
+    assert plan.atlas is not None
+    model, varies = plan.spec.model, plan.spec.varies
+    papers = Papers(
+        fill(model, varies, params, "mat_texture"), fill(model, varies, params, "mat_texrepeat")
+    )
+    return apply_textures(colour, depth, setting, poses, skins, plan.atlas, papers)
 
 
 def _render(
@@ -277,19 +342,29 @@ def _render(
     poses = _check_poses(geom_xpos, geom_xmat, spec.model.ngeom)
     look = own
     if camera_pose is not None or any(field in spec.varies for field in LOOK_FIELDS):
-        look = make_look(spec, params, _check_camera_pose(camera_pose))
+        look = fence(make_look(spec, params, _check_camera_pose(camera_pose)))
     setting = _make_setting(plan, look, params)
+    skins = plan.moving_skins
     if camera_pose is not None or background is None:
         background = cast(plan.still, plan.still_poses, setting, empty_surface(setting))
+        skins = plan.still_skins + plan.moving_skins
     surface = cast(plan.moving, poses, setting, background)
-    hit = surface.w > 0
-    depth = 1 / jnp.where(hit, surface.w, jnp.ones_like(surface.w))
+    if skins:
+        # Or XLA on CPU would cast all rays again for each texel.
+        unlit, w, *lambert = materialize(surface.unlit, surface.w, *surface.lambert)
+        surface = Surface(w, tuple(lambert), unlit)
+    depth, hit = _depth(surface)
     cosines = incidence(surface, depth)
+    strength = fill(spec.model, spec.varies, params, "light_shadow")
     for light in plan.shadows:
         dark = covered(plan.moving, poses, setting, depth, light)
         dark = dark | covered(plan.still, plan.still_poses, setting, depth, light)
+        number = spec.lights[light]
+        if number in spec.varies.get("light_shadow", ()):
+            dark = dark & (strength[number] > 0)
         cosines[light] = jnp.where(dark, jnp.zeros_like(depth), cosines[light])
-    colour = plan.colour(surface, depth, setting, _all_poses(plan, poses))
+    colour = geom_colour(surface)
+    colour = _paint(plan, skins, colour, depth, setting, _all_poses(plan, poses), params)
     packed = shade(colour, cosines, look.light_diffuse, look.ambient)
     return packed, jnp.where(hit, depth, jnp.inf)
 
@@ -312,7 +387,8 @@ def _packed(
     camera_pose: CameraPose | None = None,
 ) -> jax.Array:
     packed, _ = _render(plan, own, background, geom_xpos, geom_xmat, params, camera_pose)
-    return materialize(packed)[0]
+    packed = materialize(packed)[0]
+    return materialize(average(packed, plan.edge))[0] if plan.edge > 1 else packed
 
 
 def _packed_and_depth(
@@ -326,6 +402,9 @@ def _packed_and_depth(
 ) -> tuple[jax.Array, jax.Array]:
     packed, depth = _render(plan, own, background, geom_xpos, geom_xmat, params, camera_pose)
     packed, depth = materialize(packed, depth)
+    if plan.edge > 1:
+        middle = slice(plan.edge // 2, None, plan.edge)
+        packed, depth = materialize(average(packed, plan.edge), depth[middle, middle])
     return packed, depth
 
 
@@ -365,7 +444,7 @@ def _validate_varies(model: mujoco.MjModel, varies: Varies | None) -> None:
         if field in (varies or {}):
             raise ValueError(
                 f"{field!r} changes the image, but the renderer cannot vary it by episode; "
-                f"it varies {', '.join(('geom_size', *LOOK_FIELDS))}"
+                f"it varies {', '.join((*_OTHER_FIELDS, *LOOK_FIELDS))}"
             )
 
 

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_arm.render import primitives, shadows
+from mjx_arm.render.algebra import fence
 from mjx_arm.render.geoms import GeomGroup
 from mjx_arm.render.packing import NO_GEOM
 from mjx_arm.render.primitives import Hit
@@ -55,6 +56,7 @@ class Setting(NamedTuple):
       sizes: `[ngeom, 3] float32`, as `geom_size` of the model, m.
       unlit: `[ngeom] uint32`, packed pixel of each geom in its own colour.
       shown: `[ngeom] bool`, whether each geom is shown; None if all are.
+      varies: whether camera or lights differ from frame to frame.
     """
 
     view: View
@@ -63,6 +65,7 @@ class Setting(NamedTuple):
     sizes: jax.Array | np.ndarray
     unlit: jax.Array
     shown: jax.Array | None
+    varies: bool
 
 
 class GeomPoses(NamedTuple):
@@ -140,6 +143,7 @@ def _each(
     prepared = jax.vmap(lambda *geom: prepare(group.kind, *geom))(
         jnp.asarray(setting.sizes[group.ids]), poses.xpos[group.ids], poses.xmat[group.ids]
     )
+    prepared = fence(prepared) if setting.varies else prepared
     return [jax.tree.map(lambda leaf, i=i: leaf[i], prepared) for i in range(len(group.ids))]
 
 

@@ -34,7 +34,7 @@ _AGENTS = pathlib.Path(__file__).parents[1] / "agents"
 # Means the scene in an agent's file where a scene's name is asked for.
 STORED = "stored"
 # What an agent sees; all other options of the environment are fixed by its name.
-_SIGHT = ("scene", "task", "observation", "size", "camera", "shadows")
+_SIGHT = ("scene", "task", "observation", "size", "camera", "shadows", "samples")
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -207,7 +207,8 @@ def load_agent(
 ) -> Agent:
     """Reads a trained agent, with the environment to try it in.
 
-    What the agent sees is as in its training; all else is as the environment's name fixes it:
+    What the agent sees and what domain randomisation varies are as in its training, with ranges at
+    their full width; all else is as the environment's name fixes it:
     1,000 iterations, and in B new places for all objects after every episode, failed ones included.
 
     Args:
@@ -327,6 +328,7 @@ def evaluation_config(
         reward_scale=trained.reward_scale,
         physics=trained.physics,
         max_steps=max_steps,
+        randomise=dataclasses.replace(trained.randomise, growth_steps=0),
         **sight,
     )
     start = set_options(start, {"env": env or trained.env})

@@ -7,7 +7,8 @@ import dataclasses
 import mujoco
 import numpy as np
 
-from mjx_arm.render.geoms import SUPPORTED_TYPES, geom_rgba, visible_geoms
+from mjx_arm.render.geoms import SUPPORTED_TYPES, geom_rgba, texture_of, visible_geoms
+from mjx_arm.render.texture import mean_colour
 from mjx_arm.varies import Params, Varies, fill
 
 _ROUND = 24
@@ -51,6 +52,11 @@ def make_shapes(
     varying = list((varies or {}).get("geom_rgba", ()))
     if varying:
         colours[varying] = np.asarray((params or {})["geom_rgba"])
+    for geom in np.flatnonzero(visible_geoms(mj_model, varies)).tolist():
+        texture = texture_of(mj_model, geom)
+        if texture >= 0:
+            # The viewer shows plain colours.
+            colours[geom, :3] *= mean_colour(mj_model, texture).astype(np.float32)
     shapes = []
     for geom in np.flatnonzero(visible_geoms(mj_model, varies)).tolist():
         kind = SUPPORTED_TYPES[int(mj_model.geom_type[geom])]

@@ -14,7 +14,7 @@ from mujoco_reference import at, geom_poses, random_primitives, random_qpos, wri
 
 from mjx_arm import make_renderer, rgb, segmentation
 from mjx_arm.kinematics import make_camera_pose
-from mjx_arm.scene import Scene
+from mjx_arm.scene import Scene, load_scene
 
 POSES = 50
 # OpenGL renders round bodies as polyhedra and rounds coordinates to subpixels.
@@ -127,3 +127,34 @@ def test_colours_match(
     if not shadows:
         interior = _interior(np.asarray(segmentation(packed)))
         assert error[interior].mean() < MAX_INTERIOR_ERROR
+
+
+DESK_POSES = 40
+
+
+@pytest.mark.parametrize("shadows", [False, True])
+def test_the_desk_matches(shadows: bool) -> None:
+    """Textures, two lights and the wall: the median of all channels and pixels, of 255."""
+    scene, size = load_scene("arm_cube_desk"), (64, 64)
+    qposes = random_qpos(scene.mj_model, DESK_POSES, seed=8)
+    render = jax.jit(jax.vmap(make_renderer(scene, size=size, shadows=shadows)))
+    packed = render(*geom_poses(scene.mj_model, qposes))
+    truth = _opengl_rgb(scene, qposes, size, shadows)
+    error = np.abs(np.asarray(rgb(packed), float) - truth)
+    assert np.median(error) < 3
+    assert error.mean() < 2 * MAX_RGB_ERROR
+    # Its textures are seen: neighbours on the table differ.
+    table = np.asarray(segmentation(packed)) == scene.mj_model.geom("table").id
+    assert np.std(truth[table]) > 5
+
+
+def test_several_samples_come_closer_to_smoothed_edges(arm: Scene) -> None:
+    size = (64, 64)
+    qposes = random_qpos(arm.mj_model, 10, seed=9)
+    truth = _opengl_rgb(arm, qposes, size, shadows=False)
+    errors = []
+    for samples in (1, 4):
+        render = jax.jit(jax.vmap(make_renderer(arm, size=size, samples=samples)))
+        image = np.asarray(rgb(render(*geom_poses(arm.mj_model, qposes))), float)
+        errors.append(np.abs(image - truth).mean())
+    assert errors[1] < 0.7 * errors[0]

@@ -64,3 +64,11 @@ def test_shapes_take_what_varies_by_episode():
     (shape,) = make_shapes(model, {"geom_size": (0,), "geom_rgba": (0,)}, params)
     assert shape.vertices[:, 0].max() == pytest.approx(0.5)
     assert (shape.colour, shape.opacity) == ((0, 0, 255), 0.5)
+
+
+def test_a_texture_is_shown_by_its_mean_colour():
+    scene = load_scene("arm_cube_desk")
+    shapes = {shape.name: shape for shape in make_shapes(scene.mj_model)}
+    red, green, blue = shapes["table"].colour
+    assert 60 < blue < green < red < 200
+    assert shapes["cube"].colour[0] > 200

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import functools
 from collections.abc import Mapping
 from typing import Literal
@@ -88,6 +89,8 @@ class Lift:
         self.cube_qpos = int(model.jnt_qposadr[scene.find("joint", _CUBE)])
         self.pad_geoms = _find_pads(scene)
         self.half_size = _check_cube(scene, self.cube_geom, arm)
+        # The same, or where it varies by episode that of the episode, m.
+        self._half: float | jax.Array = self.half_size
         self._centre, extent = rectangle(scene, "cube_rectangle")
         self._extent = extent * np.float32(config.rectangle_scale)
         self._home = arm.home_qpos[self.cube_qpos : self.cube_qpos + 2]
@@ -106,6 +109,15 @@ class Lift:
             return ()
         return (Obstacle(self.cube_geom, self.half_size * float(np.sqrt(3))),)
 
+    def with_params(self, varies: Varies, params: Params) -> Lift:
+        """The same task with the cube's size in an episode, where that varies."""
+        rows = varies.get("geom_size", ())
+        if self.cube_geom not in rows:
+            return self
+        task = copy.copy(self)
+        task._half = params["geom_size"][rows.index(self.cube_geom), 0]
+        return task
+
     def fixed_placement(self) -> jax.Array:
         """The cube's place in the keyframe `home`, `[2] float32`, m."""
         return jnp.asarray(self._home)
@@ -121,8 +133,12 @@ class Lift:
         """Puts the cube on its place, or into the gripper, which is closed then."""
         arm, cube = self.arm, slice(self.cube_qpos, self.cube_qpos + 7)
         if self.config.start == "home":
-            return qpos.at[self.cube_qpos : self.cube_qpos + 2].set(placement), ctrl, {}
-        qpos = qpos.at[arm.finger_qpos].set(np.float32(self.half_size - _SQUEEZE))
+            qpos = qpos.at[self.cube_qpos : self.cube_qpos + 2].set(placement)
+            if isinstance(self._half, jax.Array):
+                # Higher or lower than the scene has it, by what the cube is larger or smaller.
+                qpos = qpos.at[self.cube_qpos + 2].add(self._half - self.half_size)
+            return qpos, ctrl, {}
+        qpos = qpos.at[arm.finger_qpos].set(_f32(self._half - _SQUEEZE))
         ctrl = ctrl.at[arm.gripper_ctrl].set(arm.ctrl_range[arm.gripper_ctrl, 0])
         poses = self._kinematics(qpos)
         # The pads are spheres without a rotation of their own, so theirs is the gripper's.
@@ -140,7 +156,7 @@ class Lift:
         poses = state.physics.poses
         cube = poses.geom_xpos[self.cube_geom]
         offset = poses.site_xpos[self.arm.grasp_site] - cube
-        height = cube[2] - np.float32(self.half_size)
+        height = cube[2] - _f32(self._half)
         held = grasped(self, poses, state.ctrl) & ~state.physics.diverged
         return {
             "grasped": held,
@@ -171,7 +187,7 @@ def grasped(task: Lift, poses: Poses, ctrl: jax.Array) -> jax.Array:
       `[] bool`.
     """
     radius = task._model.geom_size[task.pad_geoms, 0].astype(np.float32)
-    half = np.float32(task.half_size)
+    half = _f32(task._half)
     offset = poses.geom_xpos[task.pad_geoms] - poses.geom_xpos[task.cube_geom]
     rotation = poses.geom_xmat[task.cube_geom]
     local = jnp.sum(offset[..., :, None] * rotation, axis=-2)
@@ -234,6 +250,10 @@ def _terms(
         "lift": jnp.where(holding, lift, zero),
         "success": jnp.where(success, jnp.full_like(zero, config.success_reward), zero),
     }
+
+
+def _f32(value: float | jax.Array) -> np.float32 | jax.Array:
+    return value if isinstance(value, jax.Array) else np.float32(value)
 
 
 def _find_pads(scene: Scene) -> np.ndarray:

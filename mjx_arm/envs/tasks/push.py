@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import functools
 from collections.abc import Mapping
 from typing import TypeAlias
@@ -88,6 +89,9 @@ class Push:
         centre, extent = rectangle(scene, _RECTANGLE)
         self._low, self._high = centre - extent, centre + extent
         self._cube_radius = float(np.linalg.norm(model.geom_size[self.cube_geom]))
+        self._cube_half_height = float(model.geom_size[self.cube_geom, 2])
+        # By what it lies higher than in the scene, because it is larger in the episode, m.
+        self._cube_raised: jax.Array | None = None
         mark = model.geom_pos[self.mark_geom].astype(np.float32)
         self._mark_height = mark[2:]
         self._fixed = {"cube": arm.home_qpos[self.cube_qpos : self.cube_qpos + 2], "mark": mark[:2]}
@@ -103,6 +107,16 @@ class Push:
     def obstacles(self) -> tuple[Obstacle, ...]:
         """The cube by its bounding sphere."""
         return (Obstacle(self.cube_geom, self._cube_radius),)
+
+    def with_params(self, varies: Varies, params: Params) -> Push:
+        """The same task with the cube's size in an episode, where that varies."""
+        rows = varies.get("geom_size", ())
+        if self.cube_geom not in rows:
+            return self
+        task = copy.copy(self)
+        half = params["geom_size"][rows.index(self.cube_geom), 2]
+        task._cube_raised = half - self._cube_half_height
+        return task
 
     def fixed_placement(self) -> Places:
         """The cube's place in the keyframe `home`, and the mark's in the scene."""
@@ -126,6 +140,8 @@ class Push:
         """Puts cube and mark on their places."""
         mark = jnp.concatenate([placement["mark"], jnp.asarray(self._mark_height)])
         qpos = qpos.at[self.cube_qpos : self.cube_qpos + 2].set(placement["cube"])
+        if self._cube_raised is not None:
+            qpos = qpos.at[self.cube_qpos + 2].add(self._cube_raised)
         return qpos, ctrl, {"geom_pos": mark[None]}
 
     def accepts(self, poses: Poses, placement: Places) -> jax.Array:
