@@ -42,7 +42,15 @@ from mjx_arm.render.surface import (
     covered,
     empty_surface,
 )
-from mjx_arm.render.texture import Atlas, Papers, Skin, apply_textures, make_atlas, make_skins
+from mjx_arm.render.texture import (
+    Atlas,
+    Papers,
+    Skin,
+    apply_textures,
+    look_up,
+    make_atlas,
+    make_skins,
+)
 from mjx_arm.varies import Params, Varies, check_params, check_varies, fill, own_params
 
 # Fields that would change the image, but that the renderer takes from the model only.
@@ -292,9 +300,8 @@ def _background(plan: _Plan, look: Look) -> Surface:
     surface = cast(plan.still, plan.still_poses, setting, empty_surface(setting))
     if not plan.still_skins:
         return surface
-    depth, _ = _depth(surface)
     colour = geom_colour(surface)
-    colour = _paint(plan, plan.still_skins, colour, depth, setting, plan.still_poses, own)
+    colour = _paint(plan, plan.still_skins, colour, setting, plan.still_poses, own)
     channels = (colour.red, colour.green, colour.blue)
     levels = [jnp.round(channel).astype(jnp.uint32) for channel in channels]
     return surface._replace(unlit=pack(levels[0], levels[1], levels[2], colour.geom))
@@ -310,12 +317,16 @@ def _paint(
     plan: _Plan,
     skins: list[Skin],
     colour: Colour,
-    depth: jax.Array,
     setting: Setting,
     poses: GeomPoses,
     params: Params,
 ) -> Colour:
-    """The colours with the textures of `skins`."""
+    """The colours with the textures of `skins`.
+
+    Their geoms are cast once more, alone: where one is the nearest of all geoms, it is the nearest
+    of these. Looking the textures up from the surface of all geoms would cast all of them again,
+    since on CPU each array that a kernel leaves behind costs a pass of its own.
+    """
     if not skins:
         return colour
     assert plan.atlas is not None
@@ -323,7 +334,12 @@ def _paint(
     papers = Papers(
         fill(model, varies, params, "mat_texture"), fill(model, varies, params, "mat_texrepeat")
     )
-    return apply_textures(colour, depth, setting, poses, skins, plan.atlas, papers)
+    members = np.zeros(model.ngeom, bool)
+    members[[skin.geom for skin in skins]] = True
+    nearest = cast(geom_groups(model, members), poses, setting, empty_surface(setting))
+    depth, _ = _depth(nearest)
+    texels = look_up(nearest.unlit >> 24, depth, setting, poses, skins, plan.atlas, papers)
+    return apply_textures(colour, skins, texels)
 
 
 def _render(
@@ -349,10 +365,6 @@ def _render(
         background = cast(plan.still, plan.still_poses, setting, empty_surface(setting))
         skins = plan.still_skins + plan.moving_skins
     surface = cast(plan.moving, poses, setting, background)
-    if skins:
-        # Or XLA on CPU would cast all rays again for each texel.
-        unlit, w, *lambert = materialize(surface.unlit, surface.w, *surface.lambert)
-        surface = Surface(w, tuple(lambert), unlit)
     depth, hit = _depth(surface)
     cosines = incidence(surface, depth)
     strength = fill(spec.model, spec.varies, params, "light_shadow")
@@ -364,7 +376,7 @@ def _render(
             dark = dark & (strength[number] > 0)
         cosines[light] = jnp.where(dark, jnp.zeros_like(depth), cosines[light])
     colour = geom_colour(surface)
-    colour = _paint(plan, skins, colour, depth, setting, _all_poses(plan, poses), params)
+    colour = _paint(plan, skins, colour, setting, _all_poses(plan, poses), params)
     packed = shade(colour, cosines, look.light_diffuse, look.ambient)
     return packed, jnp.where(hit, depth, jnp.inf)
 

@@ -14,6 +14,7 @@ interpolates between two such sizes as well.
 from __future__ import annotations
 
 import dataclasses
+import functools
 from typing import NamedTuple
 
 import jax
@@ -40,7 +41,8 @@ class Atlas:
 
     Attributes:
       texels: `[n] uint32`, red, green and blue in the low three bytes. A texture's sizes follow one
-        another, the largest first.
+        another, the largest first. Each face begins at a multiple of its largest size, so that the
+        low bits of a place are the column, and the next ones the row.
       start: `[ntex] int32`, where the first face of a texture begins.
       stride: `[ntex] int32`, from one face of a cube to the next; 0 where all are the same.
       levels: `[ntex] int32`, log2 of the edge.
@@ -62,12 +64,15 @@ def make_atlas(mj_model: mujoco.MjModel) -> Atlas:
     for texture in range(mj_model.ntex):
         if why_not_rendered(mj_model, texture):
             continue
-        faces = [_pyramid(face) for face in _images(mj_model, texture)]
-        start[texture] = size
-        stride[texture] = len(faces[0]) if len(faces) > 1 else 0
+        whole = int(mj_model.tex_width[texture]) ** 2
+        # 4/3 of the largest size, and what is left until the next multiple of it.
+        faces = [_padded(_pyramid(face), 2 * whole) for face in _images(mj_model, texture)]
+        gap = -size % whole
+        start[texture] = size + gap
+        stride[texture] = 2 * whole if len(faces) > 1 else 0
         levels[texture] = int(mj_model.tex_width[texture]).bit_length() - 1
-        pieces += faces
-        size += sum(len(face) for face in faces)
+        pieces += [np.zeros(gap, np.uint32), *faces]
+        size += gap + sum(len(face) for face in faces)
     return Atlas(
         texels=np.concatenate(pieces) if pieces else np.zeros(1, np.uint32),
         start=start,
@@ -75,6 +80,10 @@ def make_atlas(mj_model: mujoco.MjModel) -> Atlas:
         levels=levels,
         cube=np.asarray(mj_model.tex_type) == _CUBE,
     )
+
+
+def _padded(texels: np.ndarray, size: int) -> np.ndarray:
+    return np.concatenate([texels, np.zeros(size - len(texels), np.uint32)])
 
 
 def mean_colour(mj_model: mujoco.MjModel, texture: int) -> np.ndarray:
@@ -180,19 +189,33 @@ class _Lookup(NamedTuple):
     clamped: jax.Array
 
 
-def apply_textures(
-    colour: Colour,
+class Texels(NamedTuple):
+    """What each pixel found, each `[H, W]`.
+
+    Attributes:
+      corners: four packed texels: upper left, upper right, lower left and lower right.
+      x: share of the way from the left to the right ones, 0..1.
+      y: share of the way from the upper to the lower ones.
+    """
+
+    corners: tuple[jax.Array, ...]
+    x: jax.Array
+    y: jax.Array
+
+
+def look_up(
+    geom: jax.Array,
     depth: jax.Array,
     setting: Setting,
     poses: GeomPoses,
     skins: list[Skin],
     atlas: Atlas,
     papers: Papers,
-) -> Colour:
-    """Multiplies the colours of textured geoms by their textures.
+) -> Texels:
+    """Looks the textures up at every pixel.
 
     Args:
-      colour: of the nearest surface.
+      geom: `[H, W] uint32`, id of the nearest textured geom.
       depth: `[H, W] float32`, its z-depth, m.
       setting: camera and sizes.
       poses: of all geoms.
@@ -200,18 +223,23 @@ def apply_textures(
       atlas: the textures.
       papers: which texture each material has, and how often it repeats.
     """
-    textured = jnp.zeros(depth.shape, bool)
     chosen: _Lookup | None = None
     for skin in skins:
         found = _look(skin, depth, setting, poses, atlas, papers)
-        here = colour.geom == jnp.uint32(skin.geom)
-        textured = textured | here
+        here = geom == jnp.uint32(skin.geom)
         chosen = found if chosen is None else _where(here, found, chosen)
     assert chosen is not None
-    texels = _sample(chosen, depth, setting, atlas)
+    return _sample(chosen, depth, setting, atlas)
+
+
+def apply_textures(colour: Colour, skins: list[Skin], texels: Texels) -> Colour:
+    """Multiplies the colours of textured geoms by their textures."""
+    textured = functools.reduce(
+        jnp.logical_or, (colour.geom == jnp.uint32(skin.geom) for skin in skins)
+    )
     red, green, blue = (
         jnp.where(textured, own * texel * np.float32(1 / 255), own)
-        for own, texel in zip((colour.red, colour.green, colour.blue), texels, strict=True)
+        for own, texel in zip((colour.red, colour.green, colour.blue), _mix(texels), strict=True)
     )
     return Colour(red, green, blue, colour.geom)
 
@@ -239,16 +267,24 @@ def _look(
     repeat = jnp.asarray(papers.repeat[skin.material], jnp.float32) / 2
     repeat = repeat / inverse[:2] if skin.uniform else repeat
     begin = jnp.where(size[:2] > 0, repeat, -0.5)
-    origin, forms, inverse, repeat, begin = fence((origin, forms, inverse, repeat, begin))
+    # As floats, which a fence holds; they are exact up to 16 million texels.
+    number = jnp.asarray(papers.texture[skin.material]).astype(jnp.int32)
+    tables = [
+        jnp.asarray(table, jnp.float32)[number]
+        for table in (atlas.start, atlas.levels, atlas.stride)
+    ]
+    origin, forms, inverse, repeat, begin, tables, density = fence(
+        (origin, forms, inverse, repeat, begin, tables, jnp.mean(inverse))
+    )
+    start, levels, stride = (value.astype(jnp.int32) for value in tables)
     rays = [affine(form, setting.rays.u, setting.rays.v) for form in forms]
     point = [o + depth * ray for o, ray in zip(origin, rays, strict=True)]
     unit = [x * k for x, k in zip(point, inverse, strict=True)]
-    number = jnp.asarray(papers.texture[skin.material]).astype(jnp.int32)
-    start, levels = jnp.asarray(atlas.start)[number], jnp.asarray(atlas.levels)[number]
     normal = _normal_of_box(unit, forms) if skin.box else (forms[2, 0], forms[2, 1], forms[2, 2])
     if skin.cube:
-        s, t, density, face = _on_cube(*((point, 1.0) if skin.uniform else (unit, inverse)))
-        start = start + jnp.asarray(atlas.stride)[number] * face
+        mean = jnp.ones_like(density) if skin.uniform else density
+        s, t, density, face = _on_cube(point if skin.uniform else unit, mean, skin.uniform)
+        start = start + stride * face
     else:
         place = _on_box(unit, inverse) if skin.box else (unit[0], unit[1], inverse[0], inverse[1])
         s, t = begin[0] + repeat[0] * place[0], begin[1] - repeat[1] * place[1]
@@ -295,11 +331,16 @@ def _on_box(
 
 
 def _on_cube(
-    direction: list[jax.Array], scale: jax.Array | float
+    direction: list[jax.Array], density: jax.Array, metric: bool
 ) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
     """Coordinates s and t, density and face 0 to 5 (+x, -x, +y, -y, +z, -z), each `[H, W]`.
 
-    Table 8.19 of OpenGL 4.6. `scale` has the units of `direction` in a metre, `[3]` or one number.
+    Table 8.19 of OpenGL 4.6.
+
+    Args:
+      direction: from the geom's centre, three times `[H, W]`, in half lengths or in metres.
+      density: units of it in a metre, 1/m.
+      metric: whether it is in metres.
     """
     x, y, z = direction
     along_z = jnp.abs(z) >= greater(jnp.abs(x), jnp.abs(y))
@@ -308,55 +349,114 @@ def _on_cube(
     back = major < 0
     right = jnp.where(along_x, jnp.where(back, z, -z), jnp.where(along_z & back, -x, x))
     down = jnp.where(along_x | along_z, -y, jnp.where(back, -z, z))
-    half = 0.5 / greater(jnp.abs(major), jnp.full_like(major, _TINY))
+    # In half lengths it is 1 on the surface.
+    half = 0.5 / greater(jnp.abs(major), jnp.full_like(major, _TINY)) if metric else 0.5
     axis = jnp.where(along_z, 4, jnp.where(along_x, 0, 2))
     face = axis + back.astype(jnp.int32)
-    return right * half + 0.5, down * half + 0.5, half * jnp.mean(scale), face
+    return right * half + 0.5, down * half + 0.5, half * density, face
 
 
-def _sample(
-    look: _Lookup, depth: jax.Array, setting: Setting, atlas: Atlas
-) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Red, green and blue of the textures, each `[H, W] float32` in 0..255."""
-    step2 = _footprint2(look, depth, setting)
-    # The exponent of a float is the whole part of its log2: half of that of 2 x² is the nearest to
-    # log2(x).
-    bits = jax.lax.bitcast_convert_type(2 * step2, jnp.int32)
-    level = jnp.clip(look.levels + (((bits >> 23) - 127) >> 1), 0, look.levels)
+def _sample(look: _Lookup, depth: jax.Array, setting: Setting, atlas: Atlas) -> Texels:
+    """Looks up the four texels around the place that each pixel sees."""
+    level = jnp.clip(look.levels + _step_level(look, depth, setting), 0, look.levels)
     left = look.levels - level
-    # The sizes before this one have 4^n + 4^(n-1) + ... texels.
-    before = ((4 << (2 * look.levels)) - (4 << (2 * left))) // 3
-    start, mask = look.start + before, (1 << left) - 1
+    # The sizes before this one have 4^n + 4^(n-1) + ... texels; (4^k - 1) / 3 is every second bit.
+    bits = [0x55555555 & ((4 << (2 * x)) - 1) for x in (look.levels, left)]
+    before = bits[0] - bits[1]
+    mask = (1 << left) - 1
     edge = (1 << left).astype(jnp.float32)
     x, y = look.s * edge - 0.5, look.t * edge - 0.5
     x0, y0 = jnp.floor(x), jnp.floor(y)
-    columns = [_wrap(x0.astype(jnp.int32) + i, mask, look.clamped) for i in (0, 1)]
-    rows = [_wrap(y0.astype(jnp.int32) + i, mask, look.clamped) << left for i in (0, 1)]
-    places = [(start + row + column).astype(jnp.uint32) for row in rows for column in columns]
-    # A kernel with lookups in memory is not vectorised: it must not have the other arithmetic of
-    # the image in it, before or after, which would take ten times as long.
-    *places, x, y = materialize(*places, x - x0, y - y0)
+    column, row = (_wrap(z.astype(jnp.int32), mask, look.clamped) for z in (x0, y0))
+    place = look.start + before + (row << left) + column
+    # Before the first texel there is none to mix with, where the texture does not repeat.
+    x, y = (
+        jnp.where(look.clamped & (low < 0), jnp.zeros_like(low), full - low)
+        for low, full in ((x0, x), (y0, y))
+    )
+    return _read(place, left, look.clamped, x, y, atlas)
+
+
+class _Word(NamedTuple):
+    """How a place and all that is needed to read around it are in one uint32: numbers of bits."""
+
+    place: int
+    share: int
+
+
+def _word_of(atlas: Atlas) -> _Word:
+    # No place has all bits set, so that no word is the one that `materialize` takes for none.
+    place = len(atlas.texels).bit_length()
+    # Four bits are log2 of the edge, one says whether the texture repeats.
+    return _Word(place, min(8, (32 - 5 - place) // 2))
+
+
+def _read(
+    place: jax.Array,
+    left: jax.Array,
+    clamped: jax.Array,
+    x: jax.Array,
+    y: jax.Array,
+    atlas: Atlas,
+) -> Texels:
+    """Reads the texels at a place, right of it, below it, and right below it.
+
+    A kernel with lookups in memory is not vectorised, so it has nothing else to do. The one before
+    it leaves a single word for each pixel.
+    """
+    bits = _word_of(atlas)
+    steps = 1 << bits.share
+    shares = [lesser(jnp.floor(z * steps), jnp.full_like(z, steps - 1)) for z in (x, y)]
+    fields = [(place, 0), (left, bits.place), (clamped, bits.place + 4)]
+    fields += [(z, bits.place + 5 + i * bits.share) for i, z in enumerate(shares)]
+    word = jnp.zeros(place.shape, jnp.uint32)
+    for value, shift in fields:
+        word = word | (value.astype(jnp.uint32) << shift)
+    (word,) = materialize(word)
+
+    def field(shift: int, size: int) -> jax.Array:
+        return ((word >> shift) & ((1 << size) - 1)).astype(jnp.int32)
+
+    place, left = field(0, bits.place), field(bits.place, 4)
+    clamped = field(bits.place + 4, 1) > 0
+    mask = (1 << left) - 1
+    column, row = place & mask, (place >> left) & mask
+    right, below = (_wrap(z + 1, mask, clamped) - z for z in (column, row))
     texels = jnp.asarray(atlas.texels)
+    places = [place, place + right, place + (below << left), place + (below << left) + right]
     corners = materialize(*(texels.at[i].get(mode="promise_in_bounds") for i in places))
-    return _mix(list(corners), x, y)
+    x, y = (
+        (field(bits.place + 5 + i * bits.share, bits.share).astype(jnp.float32) + 0.5) / steps
+        for i in (0, 1)
+    )
+    return Texels(corners, x, y)
 
 
-def _footprint2(look: _Lookup, depth: jax.Array, setting: Setting) -> jax.Array:
-    """Square of how far the texture moves from a pixel to the next, in its edges, `[H, W]`.
+def _step_level(look: _Lookup, depth: jax.Array, setting: Setting) -> jax.Array:
+    """log2 of how far the texture moves from a pixel to the next, in its edges, `[H, W] int32`.
 
-    The larger one of the ways to the right and upwards, as in OpenGL 4.6, equation 8.9. The point
-    of a plane with normal n that the ray d meets at depth z moves by `z (r - d (r n) / (d n))`
-    when the ray moves by r.
+    The larger one of the ways to the right and upwards, as in OpenGL 4.6, equation 8.9, rounded.
+    The point of a plane with normal n that the ray d meets at depth z moves by
+    `z (r - d (r n) / (d n))` when the ray moves by r.
     """
     rays, (height, width) = setting.rays, depth.shape
     facing = look.normal[0] * rays.u + (look.normal[1] * rays.v + look.normal[2])
-    inverse = 1 / jnp.where(jnp.abs(facing) < _TINY, _TINY, facing)
     right2, up2, _ = jnp.sum(setting.view.basis**2, axis=0)
-    right, up = look.normal[0] * inverse, look.normal[1] * inverse
-    across2 = right2 * (1 - 2 * rays.u * right) + rays.norm2 * right * right
-    along2 = up2 * (1 - 2 * rays.v * up) + rays.norm2 * up * up
+    # Times (d n)², so that there is no division.
+    across2, along2 = (
+        ray2 * facing * (facing - 2 * place * normal) + rays.norm2 * normal * normal
+        for ray2, place, normal in (
+            (right2, rays.u, look.normal[0]),
+            (up2, rays.v, look.normal[1]),
+        )
+    )
     ways = greater(across2 * (2 / width) ** 2, along2 * (2 / height) ** 2)
-    return ways * (depth * look.density) ** 2
+    # Floats as whole numbers are their log2 in steps of 2^-23, within 0.09.
+    top, bottom = (
+        jax.lax.bitcast_convert_type(x, jnp.int32)
+        for x in (2 * ways * (depth * look.density) ** 2, facing * facing + _TINY**2)
+    )
+    return (top - bottom) >> 24
 
 
 def _wrap(place: jax.Array, mask: jax.Array, clamped: jax.Array) -> jax.Array:
@@ -364,13 +464,11 @@ def _wrap(place: jax.Array, mask: jax.Array, clamped: jax.Array) -> jax.Array:
     return jnp.where(clamped, held, place & mask)
 
 
-def _mix(
-    corners: list[jax.Array], x: jax.Array, y: jax.Array
-) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Bilinear interpolation of four packed texels: upper left, upper right, lower left, ..."""
+def _mix(texels: Texels) -> list[jax.Array]:
+    """Bilinear interpolation: red, green and blue, each `[H, W] float32` in 0..255."""
     channels = []
     for shift in (0, 8, 16):
-        a, b, c, d = (((texel >> shift) & 255).astype(jnp.float32) for texel in corners)
-        upper, lower = a + x * (b - a), c + x * (d - c)
-        channels.append(upper + y * (lower - upper))
-    return channels[0], channels[1], channels[2]
+        a, b, c, d = (((texel >> shift) & 255).astype(jnp.float32) for texel in texels.corners)
+        upper, lower = a + texels.x * (b - a), c + texels.x * (d - c)
+        channels.append(upper + texels.y * (lower - upper))
+    return channels
