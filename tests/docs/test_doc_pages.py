@@ -50,11 +50,12 @@ def test_pages_and_notebooks_are_found():
 
 
 def test_every_language_of_the_pages_is_tested():
-    """`text` is no code; `python` and `sh` are run by test_snippets.py."""
+    """`text` is no code; `python`, `sh` and `json` are tried by test_snippets.py."""
     for path in PAGES:
         for each in snippets(path.read_text(), path.name):
-            assert each.language in ("python", "sh", "text"), f"{path.name}, line {each.line}"
-            assert each.mark in ("", "slow", "peers", "check"), f"{path.name}, line {each.line}"
+            where = f"{path.name}, line {each.line}"
+            assert each.language in ("python", "sh", "json", "text"), where
+            assert each.mark in ("", "slow", "peers", "check"), where
 
 
 def test_every_agent_has_its_card_on_the_page():

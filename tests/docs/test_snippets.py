@@ -21,6 +21,7 @@ from doc_pages import ROOT, Snippet, all_snippets, commands, split_environment
 
 import mjx_arm
 from mjx_arm.cli import _parse, main
+from mjx_arm.deploy.dynamixel import read_config
 from mjx_arm.training.agent import find_agent
 
 # What a training is shortened to. The last one of an option counts.
@@ -207,3 +208,11 @@ def test_the_job_script_starts_a_run_and_continues_it(tmp_path: pathlib.Path):
         assert done.returncode == 0, done.stderr
         assert expected in done.stdout
     assert mjx_arm.load_agent(tmp_path / "runs" / "first").env_steps == 1024
+
+
+def test_the_file_of_an_arm_can_be_read(tmp_path):
+    (snippet,) = all_snippets("json")
+    path = tmp_path / "arm.json"
+    path.write_text(snippet.text)
+    config = read_config(path)
+    assert (config.gripper_open, config.gripper_closed) == (2900, 1600)
