@@ -255,13 +255,14 @@ def test_ctrl_c_stops_the_arm_within_a_tick(run) -> None:
 
         robot.make_frame = frame
 
+    handler = signal.getsignal(signal.SIGINT)
     with stop_on_signals() as stop:
         made = run(prepare=prepare, stop=stop)
     assert made.outcome.ending == "stopped"
     assert made.outcome.reason == "stopped by the user"
     # Four ticks have moved the arm; the fifth began when the signal came, and sent nothing.
     assert made.robot.told == [*[("move", 0, -1.0)] * 4, ("stop",)]
-    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    assert signal.getsignal(signal.SIGINT) is handler
     assert read_log(made.path).end == "stopped by the user"
 
 

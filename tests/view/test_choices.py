@@ -57,7 +57,7 @@ def test_scenes_and_agents_are_told_apart():
     [
         ([], "view needs SUBJECT, an agent, a run folder or a scene"),
         (["nothing"], "nothing is not a run folder and not an agent"),
-        (["nothing"], "or a scene: arm_cube, arm_push, arm_reach"),
+        (["nothing"], "or a scene: arm_cube, arm_cube_desk, arm_push, arm_reach"),
         (["run"], "run holds no agent: the run has not saved one yet"),
         (["agent-b", "--task", "push"], "--task is for a scene; an agent brings its own"),
         (["arm_cube", "--task", "push"], "scene 'arm_cube' has no"),
