@@ -45,7 +45,7 @@ def test_several_texts_make_a_tuple():
     [
         (
             [],
-            "give a command: one of train, eval, play, figures, compare, agents, view, sweep, reproduce, transfer, deploy, export; see",
+            "view, sweep, reproduce, transfer, deploy, export; see",
         ),
         (["trian"], "unknown command 'trian': did you mean 'train'?"),
         (["train", "--num-env", "3"], "unknown option '--num-env': did you mean '--num-envs'?"),
