@@ -137,6 +137,9 @@ def test_it_runs_until_it_is_paused(page, viewer):
 @pytest.mark.slow
 def test_a_step_is_one_iteration(page, viewer):
     pause(page)
+    # A step after the end would begin another episode.
+    page.get_by_role("button", name="next seed", exact=True).click()
+    page.get_by_text(re.compile(r"step 0 · paused")).wait_for()
     step = viewer.session.step_count
     page.get_by_role("button", name="step", exact=True).click()
     page.get_by_text(f"step {step + 1} ·").wait_for()
