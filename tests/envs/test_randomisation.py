@@ -179,6 +179,7 @@ def _rollout(env: Env, steps: int, count: int = 3):
     return jax.lax.scan(step, envs, jax.random.split(jax.random.key(6), steps))[1]
 
 
+@pytest.mark.slow
 def test_a_frame_of_the_replay_is_the_frame_that_was_seen_to_the_bit(standard: Env) -> None:
     env = dataclasses.replace(standard, config=dataclasses.replace(standard.config, max_steps=7))
     _, obs, frame = jax.jit(lambda: _rollout(env, 12))()
@@ -195,6 +196,7 @@ def test_a_frame_of_the_replay_is_the_frame_that_was_seen_to_the_bit(standard: E
     assert stored < 800
 
 
+@pytest.mark.slow
 def test_delays_show_and_do_what_was_before() -> None:
     env = make(observation="state", image_delay=2, action_delay=1)
     policy = make_scripted_policy(env)
@@ -226,6 +228,7 @@ def test_delays_show_and_do_what_was_before() -> None:
         np.testing.assert_array_equal(ctrl[i, 2], expected)
 
 
+@pytest.mark.slow
 def test_ranges_grow_with_the_age_of_an_environment() -> None:
     env = make(observation="state", growth_steps=20, camera_shift=0.1, max_steps=5)
     auto = AutoReset(env)
@@ -249,6 +252,7 @@ def test_ranges_grow_with_the_age_of_an_environment() -> None:
     assert shift[-1].max() > 0.02
 
 
+@pytest.mark.slow
 def test_a_cube_of_any_size_lies_still_and_is_grasped() -> None:
     env = make(observation="state", cube_size=(0.9, 1.2), cube_mass=(0.5, 1.5))
     reset = jax.jit(jax.vmap(env.reset))
@@ -278,6 +282,7 @@ def test_a_cube_of_any_size_lies_still_and_is_grasped() -> None:
     assert grasp(state).mean() >= 0.75
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("option", ["cube_size", "link_mass", "servo_gain", "cube_mass"])
 def test_native_physics_simulates_what_the_params_say(option: str) -> None:
     """An episode is that of a model with the same numbers, by plain MuJoCo."""
@@ -368,6 +373,7 @@ def test_every_option_alone_varies_something(name: str, model) -> None:
     assert not make_randomiser(RandomisationConfig(), model, ["front"])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scene", ["arm_cube", "arm_push", "arm_reach", "panda_cube"])
 def test_the_presets_fit_every_scene(scene: str) -> None:
     task = {"arm_push": "push", "arm_reach": "reach"}.get(scene, "lift")

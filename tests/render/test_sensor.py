@@ -41,7 +41,7 @@ def test_averages_are_those_of_each_channel(edge: int) -> None:
     np.testing.assert_array_equal(segmentation(average(packed, edge)), ids)
 
 
-@pytest.mark.parametrize("samples", [4, 16])
+@pytest.mark.parametrize("samples", [4, pytest.param(16, marks=pytest.mark.slow)])
 def test_several_samples_are_the_mean_of_a_larger_image(arm: Scene, samples: int) -> None:
     edge = {4: 2, 16: 4}[samples]
     data = at(arm.mj_model, random_qpos(arm.mj_model, 1, seed=1)[0])

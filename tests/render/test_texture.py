@@ -148,7 +148,7 @@ BOXES = """
 
 
 @pytest.mark.usefixtures("opengl")
-@pytest.mark.parametrize("view", [0, 1, 2, 3])
+@pytest.mark.parametrize("view", [0, *(pytest.param(i, marks=pytest.mark.slow) for i in (1, 2, 3))])
 def test_planes_and_boxes_match_opengl(view: int) -> None:
     scene, size = textured(BOXES, SIX), (128, 128)
     model = copy.copy(scene.mj_model)
