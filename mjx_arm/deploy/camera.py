@@ -73,7 +73,7 @@ class VideoCamera:
         """The newest image; the first call waits for it.
 
         Raises:
-          RobotError: there is none.
+          RobotError: the camera has sent no image within its time, or has failed.
         """
         with self._lock:
             self._lock.wait_for(lambda: self._frame is not None or self._error, _PATIENCE)

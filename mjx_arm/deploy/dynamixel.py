@@ -103,7 +103,7 @@ def read_config(path: pathlib.Path) -> DynamixelConfig:
     """Reads the file of an arm.
 
     Raises:
-      ValueError: there is none, or it is invalid.
+      ValueError: the file is missing or invalid.
     """
     try:
         values = json.loads(path.read_text(encoding="utf-8"))

@@ -35,7 +35,7 @@ class Guard:
     arm: Arm
 
     def __post_init__(self) -> None:
-        """Raises ValueError for a box that is none, or an arm with slides."""
+        """Raises ValueError for a box without a volume, or an arm with slides."""
         if self.arm.slides.any():
             raise ValueError(
                 f"scene {self.scene.name!r} has an arm with slides; a robot moves hinges by degrees"
@@ -114,7 +114,7 @@ def make_guard(scene: Scene, arm: Arm, workspace: tuple[float, ...] | None = Non
         metre around the grasp site at home, from 5 mm to 70 cm above the ground.
 
     Raises:
-      ValueError: the arm has slides, or the box is none.
+      ValueError: the arm has slides, or the box has no volume.
     """
     limits = np.rad2deg(arm.ctrl_range[arm.ctrl].astype(np.float64))
     if workspace is not None:

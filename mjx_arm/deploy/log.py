@@ -96,7 +96,7 @@ def read_log(path: pathlib.Path) -> Recording:
     """Reads a log.
 
     Raises:
-      ValueError: there is none, it is damaged, or its end is missing.
+      ValueError: the file is missing or damaged, or it ends without the end of a run.
     """
     try:
         lines = path.read_text(encoding="utf-8").splitlines()

@@ -127,35 +127,24 @@ def _called_once(function: Callable[..., jax.Array]) -> Callable[..., jax.Array]
     """A function of batches as one of single arguments, called under vmap once with all rows."""
 
     @jax.custom_batching.custom_vmap
-    def single(*arguments: Any) -> jax.Array:
-        return function(*jax.tree.map(lambda x: x[None], arguments))[0]
-
-    @single.def_vmap
-    def batch(size: int, is_batched: list[Any], *arguments: Any) -> tuple[jax.Array, bool]:
-        return many(*_repeated(size, is_batched, arguments)), True
-
-    @jax.custom_batching.custom_vmap
     def many(*arguments: Any) -> jax.Array:
         return function(*arguments)
 
     @many.def_vmap
-    def batch_of_many(size: int, is_batched: list[Any], *arguments: Any) -> tuple[jax.Array, bool]:
-        arguments = _repeated(size, is_batched, arguments)
-        flat = jax.tree.map(lambda x: x.reshape(size * x.shape[1], *x.shape[2:]), arguments)
-        found = many(*flat)
+    def batch(size: int, is_batched: list[Any], *arguments: Any) -> tuple[jax.Array, bool]:
+        repeated = jax.tree.map(
+            lambda x, has_axis: x if has_axis else jnp.broadcast_to(x, (size, *x.shape)),
+            arguments,
+            tuple(is_batched),
+        )
+        found = many(*jax.tree.map(lambda x: x.reshape(size * x.shape[1], *x.shape[2:]), repeated))
         return found.reshape(size, -1, *found.shape[1:]), True
 
+    def single(*arguments: Any) -> jax.Array:
+        found: jax.Array = many(*jax.tree.map(lambda x: x[None], arguments))
+        return found[0]
+
     return single
-
-
-def _repeated(size: int, is_batched: list[Any], arguments: tuple[Any, ...]) -> tuple[Any, ...]:
-    """The arguments with a first axis each, also where vmap gave them none."""
-    repeated: tuple[Any, ...] = jax.tree.map(
-        lambda x, has_axis: x if has_axis else jnp.broadcast_to(x, (size, *x.shape)),
-        arguments,
-        tuple(is_batched),
-    )
-    return repeated
 
 
 def make_self_collision(

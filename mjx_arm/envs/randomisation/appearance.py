@@ -17,7 +17,7 @@ from mjx_arm.envs.randomisation.parts import (
     free_bodies,
     geoms_of,
     is_fixed,
-    largest_delay,
+    delay_of,
     scaled,
 )
 from mjx_arm.render.geoms import geom_rgba, texture_of, visible_geoms, why_not_rendered
@@ -267,7 +267,7 @@ def _sensor(ranges: Ranges) -> list[Part]:
             Part(
                 {"image_delay": (0,)},
                 1,
-                lambda u, g: {"image_delay": largest_delay(u, ranges.image_delay, g)},
+                lambda u, g: {"image_delay": delay_of(u, ranges.image_delay, g)},
             )
         )
     return parts

@@ -15,7 +15,7 @@ from mjx_arm.envs.randomisation.parts import (
     free_bodies,
     geoms_of,
     is_fixed,
-    largest_delay,
+    delay_of,
     scaled,
 )
 from mjx_arm.varies import Params, rows
@@ -139,6 +139,6 @@ def _action_delay(ranges: Ranges) -> Part | None:
         return None
 
     def make(uniform: jax.Array, growth: Growth) -> Params:
-        return {"action_delay": largest_delay(uniform, ranges.action_delay, growth)}
+        return {"action_delay": delay_of(uniform, ranges.action_delay, growth)}
 
     return Part({"action_delay": (0,)}, 1, make)

@@ -75,7 +75,13 @@ def geoms_of(mj_model: mujoco.MjModel, bodies: list[int]) -> list[int]:
     return [i for i in range(mj_model.ngeom) if int(mj_model.geom_bodyid[i]) in bodies]
 
 
-def largest_delay(uniform: jax.Array, most: int, growth: Growth) -> jax.Array:
-    """A whole number from 0 to `most`, each equally likely at full growth, as float32."""
+def delay_of(uniform: jax.Array, most: int, growth: Growth) -> jax.Array:
+    """A delay, `[] float32`: 0 to `most` whole iterations, each as likely at full growth.
+
+    Args:
+      uniform: `[] float32`, a random number in 0..1.
+      most: the largest delay, iterations.
+      growth: share of the range.
+    """
     count = jnp.floor(uniform * (growth * most + 1))
     return jnp.minimum(count, jnp.full_like(count, most))
