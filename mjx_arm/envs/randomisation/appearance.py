@@ -14,10 +14,10 @@ from mjx_arm.envs.randomisation.parts import (
     Growth,
     Part,
     between,
+    delay_of,
     free_bodies,
     geoms_of,
     is_fixed,
-    delay_of,
     scaled,
 )
 from mjx_arm.render.geoms import geom_rgba, texture_of, visible_geoms, why_not_rendered

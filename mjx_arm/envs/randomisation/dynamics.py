@@ -12,10 +12,10 @@ from mjx_arm.envs.randomisation.parts import (
     Growth,
     Part,
     between,
+    delay_of,
     free_bodies,
     geoms_of,
     is_fixed,
-    delay_of,
     scaled,
 )
 from mjx_arm.varies import Params, rows
