@@ -36,8 +36,7 @@ _WARM_UP = 100_000
 _SPREAD_UPDATES = 1_000
 # Share of the student's learning rate that is left at the end of its decay.
 _LAST_RATE = 0.05
-# A state whose advantages spread by less than this share of the running mean counts as if they did
-# by that much.
+# Least spread of a state's advantages, as a share of the running mean.
 _LEAST_SPREAD = 0.1
 # Weight of the squared error of the mean Q-value beside the cross-entropy.
 _VALUE_WEIGHT = 0.1
@@ -209,11 +208,10 @@ class Distill:
         spread = (1 - rate) * student.spread + rate * jnp.sqrt(power + 1e-10)
         parts = num_microbatches(len(target))
         rows = jax.tree.map(lambda x: x.reshape(parts, -1, *x.shape[1:]), (obs, target))
-        least = _LEAST_SPREAD * spread
 
         def loss_of(params: Params, obs: Obs, target: jax.Array) -> tuple[jax.Array, jax.Array]:
             q = self.apply(params, obs)
-            temperature = self.config.student_temperature * advantage_spread(target, least)
+            temperature = self.config.student_temperature * advantage_spread(target, spread)
             losses = jax.vmap(imitation_loss)(q, target, temperature)
             agree = jnp.argmax(q, axis=-1) == jnp.argmax(target, axis=-1)
             return jnp.mean(losses), jnp.mean(agree.astype(jnp.float32))
@@ -234,8 +232,8 @@ class Distill:
         return Student(params, opt_state, averaged, spread), self.shard.mean(metrics)
 
 
-def advantage_spread(target: jax.Array, least: jax.Array) -> jax.Array:
-    """Standard deviation of each state's advantages, `[B] float32`, but no less than `least`.
+def advantage_spread(target: jax.Array, mean: jax.Array) -> jax.Array:
+    """Standard deviation of each state's advantages, `[B] float32`, within bounds.
 
     Far from success all actions are worth nearly the same: the median state has a fifth of the root
     mean square over all states. With one temperature for all of them the student would hardly learn
@@ -243,9 +241,11 @@ def advantage_spread(target: jax.Array, least: jax.Array) -> jax.Array:
 
     Args:
       target: `[B, A] float32`, Q-values.
-      least: `[] float32`: differences far below it are the teacher's own errors.
+      mean: `[] float32`, root mean square over all states. It is also the most: near success the
+        student needs the best action as well. A tenth of it is the least: differences far below
+        are the teacher's own errors.
     """
-    return jnp.maximum(jnp.std(target, axis=-1), least)
+    return jnp.clip(jnp.std(target, axis=-1), _LEAST_SPREAD * mean, mean)
 
 
 def imitation_loss(q: jax.Array, target: jax.Array, temperature: jax.Array) -> jax.Array:

@@ -115,8 +115,9 @@ def test_loss_is_least_at_the_target():
 
 def test_the_spread_of_each_state_by_hand():
     target = jnp.asarray([[0.0, 3.0, -3.0], [5.0, 5.3, 4.7], [1.0, 1.0, 1.0]])
-    expected = [np.sqrt(6.0), np.sqrt(0.06), 0.1]
-    np.testing.assert_allclose(advantage_spread(target, jnp.float32(0.1)), expected, rtol=1e-5)
+    # Between a tenth of the mean of all states and that mean.
+    expected = [1.0, np.sqrt(0.06), 0.1]
+    np.testing.assert_allclose(advantage_spread(target, jnp.float32(1.0)), expected, rtol=1e-5)
 
 
 def test_a_state_of_small_advantages_weighs_as_much_as_one_of_large_ones():
