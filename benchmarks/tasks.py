@@ -33,7 +33,7 @@ from mjx_arm.training.loop import EVALUATION, role_key
 from mjx_arm.training.run_folder import load_config
 
 # Environment steps of training, and the success rate to reach.
-STEPS = {"reach": 500_000, "push": 2_500_000}
+STEPS = {"reach": 500_000, "push": 1_500_000}
 GOALS = {"reach": 0.95, "push": 0.85}
 EPISODES = 1_000
 EPSILON = 0.1

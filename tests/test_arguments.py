@@ -8,7 +8,9 @@ import re
 import pytest
 
 from mjx_arm.arguments import read_arguments
-from mjx_arm.cli import Train, _annotations, _parse, main
+from mjx_arm.cli import main
+from mjx_arm.cli.parse import annotations_of, parse
+from mjx_arm.cli.train import Train
 from mjx_arm.config import dump_config, train_config
 from mjx_arm.options import flat_names
 from mjx_arm.presets import PRESETS
@@ -20,7 +22,7 @@ def test_values_are_read_by_their_annotations():
         "--joint-noise None --env B --seed 3 --out some/where --stop-at 0.5 --camera front "
         "--polyak 1e-3"
     )
-    command, given = _parse(line.split())
+    command, given = parse(line.split())
     assert isinstance(command, Train)
     options = command.options
     assert (options.num_envs, options.env.size, options.seed) == (8, (32, 16), 3)
@@ -104,7 +106,7 @@ def test_the_help_lists_the_options_that_the_command_line_takes(preset, capsys):
     with pytest.raises(SystemExit):
         main(["train", "--preset", preset, "--help"])
     listed = set(re.findall(r"--[a-z][a-z0-9-]*", capsys.readouterr().out))
-    names = {*flat_names(PRESETS[preset]), *_annotations(Train)} - {"options"}
+    names = {*flat_names(PRESETS[preset]), *annotations_of(Train)} - {"options"}
     taken = {f"--{name.replace('_', '-')}" for name in names}
     assert taken <= listed
     assert {x for x in listed - taken if not x.startswith("--no-")} == {"--help"}
@@ -114,8 +116,8 @@ def test_another_algorithm_need_only_fit_together_with_the_other_options(tmp_pat
     file = tmp_path / "small.json"
     file.write_text(json.dumps(dump_config(train_config(replay_size=400, batch_size=8))))
     line = f"train --config {file} --algorithm distill --teacher-batch-size 16"
-    command, _ = _parse([*line.split(), "--student-batch-size", "8"])
+    command, _ = parse([*line.split(), "--student-batch-size", "8"])
     assert isinstance(command, Train)
     assert (command.options.algorithm, command.options.replay.replay_size) == ("distill", 400)
     with pytest.raises(ValueError, match="replay_size must be at least student_batch_size = 500"):
-        _parse([*line.split(), "--student-batch-size", "500"])
+        parse([*line.split(), "--student-batch-size", "500"])

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -20,7 +20,7 @@ from mjx_arm.envs.randomisation import Randomiser, image_varies, make_randomiser
 from mjx_arm.envs.starts import StartSampler
 from mjx_arm.envs.state import EnvState, Observation, Placement, Snapshot, Transition
 from mjx_arm.envs.tasks import find_task
-from mjx_arm.envs.tasks.base import Reward, Task
+from mjx_arm.envs.tasks.base import Reward, SizedTask, Task
 from mjx_arm.kinematics import Kinematics, Poses, make_camera_pose, make_kinematics
 from mjx_arm.options import check_name
 from mjx_arm.physics import Physics, make_physics
@@ -303,11 +303,9 @@ class Env:
 
     def _task_of(self, varies: Varies, params: Params) -> Task:
         """The task, with the sizes that its objects have in an episode."""
-        resized = getattr(self.task, "with_params", None)
-        if resized is None or not self.randomiser.resizes:
+        if not self.randomiser.resizes:
             return self.task
-        task: Task = resized(varies, params)
-        return task
+        return cast(SizedTask, self.task).with_params(varies, params)
 
     def _commanded(self, state: EnvState, action: jax.Array) -> jax.Array:
         """The targets `[nu] float32` that an action asks for, or a delayed one before it."""
@@ -375,6 +373,11 @@ def make_env(config: EnvConfig, *, reward: Reward | None = None, scene: Scene | 
     model = scene.mj_model
     check_varies(model, task.varies)
     randomiser = make_randomiser(config.randomise, model, config.cameras)
+    if randomiser.resizes and not hasattr(task, "with_params"):
+        raise ValueError(
+            f"task {config.task!r} has no method with_params(varies, params), so it would take "
+            "objects that vary in size for those of the scene: write one, or give cube_size 1 1"
+        )
     varies = merge_varies(task.varies, randomiser.varies) if randomiser else task.varies
     shown = image_varies(model, varies) if randomiser else varies
     kinematics = make_kinematics(model, varies)

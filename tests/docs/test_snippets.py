@@ -20,7 +20,8 @@ import pytest
 from doc_pages import ROOT, Snippet, all_snippets, commands, split_environment
 
 import mjx_arm
-from mjx_arm.cli import _parse, main
+from mjx_arm.cli import main
+from mjx_arm.cli.parse import parse
 from mjx_arm.deploy.dynamixel import read_config
 from mjx_arm.training.agent import find_agent
 
@@ -106,7 +107,7 @@ def test_shell_snippets_name_what_there_is(snippet: Snippet, folder: pathlib.Pat
 
 def _check_mjx_arm(words: list[str]) -> None:
     if "--help" not in words:
-        _parse(words)
+        parse(words)
 
 
 def _check_make(words: list[str]) -> None:
@@ -133,7 +134,7 @@ def _check_pip(words: list[str]) -> None:
 
 def _check_sbatch(words: list[str]) -> None:
     assert pathlib.Path(words[0]).is_file()
-    _parse(["train", *(word.replace("$seed", "0") for word in words[1:])])
+    parse(["train", *(word.replace("$seed", "0") for word in words[1:])])
 
 
 def _check_source(words: list[str]) -> None:
@@ -171,7 +172,7 @@ def _options(values: dict[str, int]) -> list[str]:
 
 def _shortened(words: list[str]) -> list[str]:
     if words[0] == "train":
-        algorithm = _parse(words)[0].options.algorithm
+        algorithm = parse(words)[0].options.algorithm
         return [*words, *_options(_SHORT | _SHORT_BATCH[algorithm])]
     return [*words, *_options(_SHORT_TRIES.get(words[0], {}))]
 

@@ -17,6 +17,7 @@ from mjx_arm.envs.auto_reset import AutoReset
 from mjx_arm.envs.env import Env, make_env
 from mjx_arm.envs.randomisation import PRESETS, RandomisationConfig, make_randomiser
 from mjx_arm.envs.scripted import make_scripted_policy
+from mjx_arm.envs.tasks.lift import Lift, LiftConfig
 from mjx_arm.render.geoms import geom_rgba
 from mjx_arm.scene import load_scene
 from mjx_arm.training.agent import evaluation_config
@@ -381,3 +382,25 @@ def test_the_presets_fit_every_scene(scene: str) -> None:
     env = make_env(dataclasses.replace(config.env, physics="native", observation="state"))
     state = jax.eval_shape(lambda key: env.reset(key)[1], jax.random.key(0))
     assert set(state.params) == set(env.varies)
+
+
+class Sizeless:
+    """`lift` without `with_params`."""
+
+    def __init__(self, *given):
+        self._lift = Lift(*given)
+
+    def __getattr__(self, name):
+        if name == "with_params":
+            raise AttributeError(name)
+        return getattr(self._lift, name)
+
+
+mjx_arm.register("sizeless", Sizeless, config=LiftConfig, scene="arm_cube_desk")
+
+
+def test_a_task_that_does_not_know_sizes_is_refused_where_they_vary():
+    with pytest.raises(ValueError, match=r"task 'sizeless' has no method with_params.*cube_size"):
+        make(task="sizeless", randomisation="standard")
+    env = make(task="sizeless", randomisation="standard", cube_size=(1.0, 1.0))
+    assert not env.randomiser.resizes

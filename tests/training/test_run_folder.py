@@ -168,12 +168,12 @@ def test_a_hangup_that_is_ignored_stays_ignored(tmp_path):
 
 WAITS = """
 import signal, sys, time
-from mjx_arm import cli
+from mjx_arm.cli import process
 def wait(arguments):
     print("started", flush=True)
     time.sleep(60)
-cli._parse = wait
-cli.run(["train"])
+process.parse = wait
+process.run(["train"])
 """
 
 

@@ -89,6 +89,19 @@ class Task(Protocol):
         ...
 
 
+class SizedTask(Task, Protocol):
+    """A task whose objects may have another size in each episode."""
+
+    def with_params(self, varies: Varies, params: Params) -> Task:
+        """The same task with the sizes of an episode.
+
+        Args:
+          varies: which rows of the model's fields `params` replace.
+          params: of the episode.
+        """
+        ...
+
+
 TaskFactory = Callable[[TaskConfig, Scene, Arm], Task]
 
 
