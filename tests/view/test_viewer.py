@@ -205,7 +205,7 @@ def test_another_agent_is_chosen(page, viewer):
     inputs = page.locator("input:not([type=range])").all()
     next(each for each in inputs if each.input_value() == "last").click()
     page.get_by_role("option", name="agent-b", exact=True).click()
-    page.get_by_text("agent-b, trained for 2,490,368 steps").wait_for()
+    page.get_by_text("agent-b, trained for 2,506,752 steps").wait_for()
     assert viewer.session.simulation.has_agent
 
 
