@@ -12,6 +12,11 @@ class RobotError(ValueError):
     """The robot, its camera or the line to it has failed; the message is one sentence."""
 
 
+def first_line(error: Exception) -> str:
+    """The first line of an error's message, or the name of its type if the message is empty."""
+    return (str(error).splitlines() or [type(error).__name__])[0]
+
+
 @dataclasses.dataclass(frozen=True)
 class Frame:
     """An image and its time.

@@ -175,6 +175,15 @@ def test_a_cable_that_is_pulled_is_one_sentence(bus, robot) -> None:
             call()
 
 
+def test_a_port_that_has_failed_is_named_once(bus, robot, monkeypatch) -> None:
+    def fail(*arguments: object) -> None:
+        raise OSError
+
+    monkeypatch.setattr(robot._packets, "txPacket", fail)
+    with pytest.raises(RobotError, match=rf"^the port {bus.port} has failed: \w+$"):
+        robot.stop()
+
+
 def test_a_port_that_is_not_there() -> None:
     with pytest.raises(RobotError, match="the port /dev/none cannot be opened"):
         DynamixelRobot(config("/dev/none"), frame)
@@ -184,10 +193,14 @@ def test_a_port_that_is_not_there() -> None:
     ("values", "sentence"),
     [
         ({"joints": [1, 2]}, "joints, signs and zeros must have one value for each joint"),
+        ({"joints": [], "signs": [], "zeros": []}, "and at least one, got 0, 0 and 0"),
         ({"signs": [1, 1, 1, 1, 1, 2]}, "signs must be 1 or -1"),
         ({"gripper": 8}, "must name each servo once"),
         ({"joint": [1]}, "unknown option 'joint': did you mean 'joints'"),
         ({"gripper_open": "wide"}, "gripper_open must be a whole number"),
+        ({"gripper_closed": 2**32}, "gripper_closed must be a whole number from -1048575 to"),
+        # Its register has 16 bits.
+        ({"gripper_current": 2**16 + 200}, "gripper_current must be a whole number from 1 to 2047"),
         ({"baudrate": 0}, "baudrate must be a whole number of at least 1"),
     ],
 )
