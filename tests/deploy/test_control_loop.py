@@ -229,7 +229,11 @@ def test_a_robot_that_is_gone_ends_the_loop(run) -> None:
     assert made.outcome.ending == "fault"
     assert made.outcome.reason == "the robot is gone"
     assert len(made.robot.told) == 3
-    assert read_log(made.path).end == "the robot is gone"
+    assert made.outcome.ticks == len(made.outcome.inference_ms) == 3
+    assert len(made.outcome.image_age_ms) == 3
+    log = read_log(made.path)
+    assert log.end == "the robot is gone"
+    assert len(log.ticks) == 3
 
 
 def test_what_is_not_foreseen_still_stops_the_arm(run, tmp_path) -> None:
@@ -264,6 +268,26 @@ def test_ctrl_c_stops_the_arm_within_a_tick(run) -> None:
     assert made.robot.told == [*[("move", 0, -1.0)] * 4, ("stop",)]
     assert signal.getsignal(signal.SIGINT) is handler
     assert read_log(made.path).end == "stopped by the user"
+
+
+def test_a_second_ctrl_c_does_not_keep_the_arm_from_being_stopped(run, tmp_path) -> None:
+    robots = []
+
+    def prepare(robot: TwoJoints) -> None:
+        robots.append(robot)
+        stop, calls = robot.stop, iter([KeyboardInterrupt])
+
+        def impatient() -> None:
+            for error in calls:
+                raise error
+            stop()
+
+        robot.stop = impatient
+
+    with pytest.raises(KeyboardInterrupt):
+        run(prepare=prepare)
+    assert robots[0].told[-1] == ("stop",)
+    assert read_log(tmp_path / "log.jsonl").end == "the time of 1 s is up"
 
 
 def test_a_policy_of_another_arm_is_rejected(guard) -> None:
