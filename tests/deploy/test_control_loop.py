@@ -325,6 +325,11 @@ def test_a_damaged_log_is_refused_by_its_line(run, tmp_path) -> None:
     cut.write_text("\n".join([*lines[:3], json.dumps(record), *lines[4:]]))
     with pytest.raises(ValueError, match="damaged at line 4"):
         read_log(cut)
+    record = json.loads(lines[3])
+    del record["q"]
+    cut.write_text("\n".join([*lines[:3], json.dumps(record), *lines[4:]]))
+    with pytest.raises(ValueError, match="damaged at line 4"):
+        read_log(cut)
     cut.write_text('{"other": 1}\n')
     with pytest.raises(ValueError, match="is not a log of mjx-arm deploy"):
         read_log(cut)
