@@ -1,4 +1,4 @@
-"""What a robot is to the control loop: a camera, joints in degrees, and a gripper."""
+"""What the control loop needs of a robot: a camera, joints in degrees, and a gripper."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Frame:
 
 
 class Robot(Protocol):
-    """An arm of n hinges with a gripper. Every method may raise `RobotError`."""
+    """An arm of n hinges with a gripper and a camera. Every method may raise `RobotError`."""
 
     def frame(self) -> Frame:
         """The newest image, at once; the first call waits until there is one."""

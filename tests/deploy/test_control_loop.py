@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from robots import SHAPE, SimulatedClock, Thinker, TwoJoints
 
-from mjx_arm.deploy.guard import Guard
+from mjx_arm.deploy.guard import Guard, make_guard
 from mjx_arm.deploy.log import Log, read_log, replay
 from mjx_arm.deploy.loop import LoopConfig, Outcome, run_loop, stop_on_signals
 from mjx_arm.deploy.robot import Frame
@@ -158,6 +158,12 @@ def test_the_gripper_stays_in_its_box(run, guard) -> None:
     assert guard.refuses(np.asarray([60.0, 10.0]), 0, -1.0) is None
     assert guard.refuses(np.asarray([60.0, 10.0]), 0, 1.0) is not None
     assert guard.refuses(np.asarray([0.0, 25.0]), 1, -1.0) is None
+
+
+@pytest.mark.parametrize("box", [(0, 0, 0, 1, 1), (0, 0, 0, 1, 1, 0), (0, 0, 0, 1, 1, np.nan)])
+def test_a_workspace_is_a_box(guard, box) -> None:
+    with pytest.raises(ValueError, match="the workspace must be x y z of its lower corner"):
+        make_guard(guard.scene, guard.arm, box)
 
 
 def image_of(robot: TwoJoints, image: object) -> None:
