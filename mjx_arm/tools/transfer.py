@@ -116,16 +116,21 @@ def _dropped(trace: Trace) -> bool:
     return bool((lost & (trace.height[:-1] >= _LIFTED)).any())
 
 
+def start_keys(seed: int, episodes: int) -> jax.Array:
+    """Keys `[episodes]` of starts that neither training nor the selection of an agent has seen."""
+    start_key, _ = jax.random.split(role_key(seed, EVALUATION))
+    return jax.random.split(start_key, episodes)
+
+
 def sample_starts(env: Env, seed: int, episodes: int) -> list[Start]:
     """Starts that neither training nor the selection of an agent has seen.
 
     Args:
       env: the environment.
       seed: of the starts.
-      episodes: how many.
+      episodes: number of starts.
     """
-    start_key, _ = jax.random.split(role_key(seed, EVALUATION))
-    qpos, ctrl = jax.device_get(_starter(env)(jax.random.split(start_key, episodes)))
+    qpos, ctrl = jax.device_get(_starter(env)(start_keys(seed, episodes)))
     return [Start(*each) for each in zip(qpos, ctrl, strict=True)]
 
 
