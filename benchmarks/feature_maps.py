@@ -22,7 +22,7 @@ from machine import machine
 from mjx_arm.standin.levels import LEVELS, find_level
 from mjx_arm.standin.opengl import find_opengl
 from mjx_arm.tools.feature_maps import Comparison, compare_moments, draw_comparisons, to_json
-from mjx_arm.tools.transfer import ITERATIONS, sample_starts
+from mjx_arm.tools.transfer import ITERATIONS
 from mjx_arm.training.agent import load_agent
 
 SEED = 7
@@ -60,8 +60,8 @@ def main() -> None:
         name, _, path = given.rpartition("=")
         name = name or pathlib.Path(path).stem
         agent = load_agent(path, max_steps=ITERATIONS, scene=options.scene)
-        starts = sample_starts(agent.env, SEED, options.starts)
-        found = compare_moments(agent, find_level(options.level), starts)
+        level = find_level(options.level)
+        found = compare_moments(agent, level, seed=SEED, episodes=options.starts)
         pictures.append((name, found[0]))
         rows[name] = {"picture": to_json(found[0]), "mean": means(found), "moments": len(found)}
         print(name, json.dumps(rows[name]["mean"]), flush=True)

@@ -22,7 +22,7 @@ from mjx_arm.render.packing import NO_GEOM, pack
 from mjx_arm.training.agent import Agent
 
 FORMATS = ("stablehlo", "onnx")
-# A StableHLO file runs on these.
+# What a StableHLO file runs on.
 _PLATFORMS = ("cpu", "cuda")
 
 
@@ -43,21 +43,24 @@ def image_shape(agent: Agent) -> tuple[int, ...]:
 
 
 def policy_function(agent: Agent) -> Callable[[jax.Array], tuple[jax.Array, jax.Array]]:
-    """The policy of an agent: `image -> (Q-values, action)`; see the module.
-
-    A network that looks at geom ids finds none: a camera does not know them.
-    """
-    packed = agent.env.config.observation == "packed"
+    """The policy of an agent that sees pixels: `image -> (Q-values, action)`; see the module."""
 
     def policy(image: jax.Array) -> tuple[jax.Array, jax.Array]:
-        obs = image
-        if packed:
-            red, green, blue = (image[..., i].astype(jnp.uint32) for i in range(3))
-            obs = pack(red, green, blue, jnp.full(red.shape, NO_GEOM, jnp.uint32))
-        q = agent.q_values(obs)
+        q = agent.q_values(to_observation(agent, image))
         return q, jnp.argmax(q).astype(jnp.int32)
 
     return policy
+
+
+def to_observation(agent: Agent, images: jax.Array) -> jax.Array:
+    """Images `[..., 3] uint8` as the observations of an agent that sees pixels.
+
+    Packed pixels get no geom ids: a camera does not know them.
+    """
+    if agent.env.config.observation != "packed":
+        return images
+    red, green, blue = (images[..., i].astype(jnp.uint32) for i in range(3))
+    return pack(red, green, blue, jnp.full(red.shape, NO_GEOM, jnp.uint32))
 
 
 def export_policy(agent: Agent) -> bytes:
@@ -123,10 +126,10 @@ def write_policy(agent: Agent, path: pathlib.Path, form: str = "stablehlo") -> N
 
 
 def check_path(path: pathlib.Path) -> None:
-    """Refuses a path that no file can be written to.
+    """Checks that a file can be written to a path.
 
     Raises:
-      ValueError: it is a folder, or its folder is not there.
+      ValueError: the path is a folder, or its folder is not there.
     """
     if path.is_dir() or not path.absolute().parent.is_dir():
         raise ValueError(f"{path} cannot be written: give a file in a folder that exists")

@@ -1,4 +1,4 @@
-"""A policy outside of its training: a compiled program, image in, Q-values and action out."""
+"""A policy as a program of its own: an image in, Q-values and an action out."""
 
 from __future__ import annotations
 
@@ -8,37 +8,42 @@ from jax import export
 
 
 class Policy:
-    """A policy from the bytes that `mjx_arm.export` writes. It needs jax and flatbuffers alone.
+    """A policy from the bytes that `mjx_arm.export.export_policy` returns.
 
     Args:
       data: StableHLO, serialised by `jax.export`.
-      where: what an error says they are from.
+      where: what an error calls the bytes, such as the name of their file.
 
     Attributes:
       image_shape: `(H, W, 3)`, or `(C, H, W, 3)` for several cameras.
-      num_actions: number of actions.
+      num_actions: number of actions A.
 
     Raises:
-      ValueError: they are something else.
+      ValueError: the bytes are something else.
     """
 
     def __init__(self, data: bytes, where: str = "the policy") -> None:
         try:
             exported = export.deserialize(bytearray(data))
             (image,), (q, _action) = exported.in_avals, exported.out_avals
-            num_actions = int(q.shape[0])
+            (num_actions,) = q.shape
+            if image.dtype != np.uint8:
+                raise TypeError(f"its input is of type {image.dtype}")
         except Exception as error:  # flatbuffers raises whatever the wrong bytes lead to
             reason = f"{type(error).__name__}: {error}".splitlines()[0]
             raise ValueError(f"{where} is no exported policy ({reason})") from error
         self.image_shape: tuple[int, ...] = tuple(image.shape)
-        self.num_actions = num_actions
+        self.num_actions: int = num_actions
         self._call = jax.jit(exported.call)
 
     def __call__(self, image: np.ndarray) -> tuple[np.ndarray, int]:
-        """Q-values `[A] float32` of an image, and the action with the largest one.
+        """Computes Q-values.
 
         Args:
-          image: `image_shape`, uint8.
+          image: of the shape `image_shape`, uint8: red, green, blue.
+
+        Returns:
+          Q-values `[A] float32`, and the action with the largest one.
 
         Raises:
           ValueError: the image has another shape or dtype.
@@ -49,7 +54,7 @@ class Policy:
 
 
 def check_image(image: object, shape: tuple[int, ...]) -> None:
-    """Refuses what is not an image of a shape, uint8.
+    """Checks that an image is an array of a given shape, uint8.
 
     Raises:
       ValueError: it is something else.

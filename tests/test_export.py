@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax import export
 
 from mjx_arm.cli import main
 from mjx_arm.export import export_policy, policy_function
@@ -91,6 +92,16 @@ def test_other_bytes_are_no_policy(data) -> None:
     with pytest.raises(ValueError, match=r"x\.bin is no exported policy") as error:
         Policy(data, "x.bin")
     assert "\n" not in str(error.value)
+
+
+def test_the_export_of_another_function_is_no_policy() -> None:
+    def policy(image: jax.Array) -> tuple[jax.Array, jax.Array]:
+        return image[0, 0], jnp.argmax(image[0, 0])
+
+    image = jax.ShapeDtypeStruct((4, 4, 3), jnp.float32)
+    data = bytes(export.export(jax.jit(policy))(image).serialize())
+    with pytest.raises(ValueError, match=r"is no exported policy .*its input is of type float32"):
+        Policy(data)
 
 
 @pytest.mark.parametrize(

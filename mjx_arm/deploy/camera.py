@@ -2,90 +2,111 @@
 
 from __future__ import annotations
 
-import os
+import subprocess
+import tempfile
 import threading
 import time
-from typing import Any
+from typing import IO
 
 import numpy as np
 from PIL import Image
 
 from mjx_arm.deploy.robot import Frame, RobotError
 
-_PATIENCE = 5.0
+# A camera sends its first image within this time, s.
+_PATIENCE = 10.0
 
 
 class VideoCamera:
     """Reads a camera in a thread, and keeps its newest image, scaled down to what the agent sees.
 
     Args:
-      source: path of a video device, such as `/dev/video0`, or of a video.
-      size: height and width of an image, pixels. The middle of the camera's image with this aspect
-        is scaled down by averaging.
+      source: path of a video device, such as `/dev/video0`, or of a video, which plays at its own
+        rate.
+      size: height and width of an image, pixels. The largest part around the middle of the camera's
+        image that has this aspect is scaled down by averaging.
 
     Raises:
-      RobotError: there is no such camera.
+      RobotError: there is no such camera, or it sends no image within 10 s.
     """
 
     def __init__(self, source: str, size: tuple[int, int]) -> None:
-        # Without this, ffmpeg is forked from a process with many threads, and may deadlock.
-        os.environ.setdefault("IMAGEIO_FFMPEG_NO_PREVENT_SIGINT", "1")
         import imageio_ffmpeg
 
         self._size = size
-        options = ["-f", "v4l2"] if source.startswith("/dev/") else []
-        frames = imageio_ffmpeg.read_frames(source, input_params=options)
-        try:
-            # Of the first frame on the description alone; width and height.
-            self._shape: tuple[int, int] = next(frames)["size"]
-        except Exception as error:  # a device that is busy, a file that is no video, ...
-            reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-            raise RobotError(f"the camera {source!r} cannot be read: {reason}") from error
         self._lock = threading.Condition()
         self._frame: Frame | None = None
         self._error = ""
-        self._ended = threading.Event()
-        self._thread = threading.Thread(target=self._read, args=(frames,), daemon=True)
+        options = ["-f", "v4l2"] if source.startswith("/dev/") else ["-re"]
+        output = ["-f", "image2pipe", "-c:v", "ppm", "-pix_fmt", "rgb24", "-"]
+        # Not a pipe, which a camera with many errors would fill.
+        self._messages = tempfile.TemporaryFile()  # noqa: SIM115 (closed by `close`)
+        self._process = subprocess.Popen(
+            [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", *options, "-i", source, *output],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=self._messages,
+        )
+        self._thread = threading.Thread(target=self._read, daemon=True)
         self._thread.start()
-
-    def _read(self, frames: Any) -> None:
-        (width, height), number = self._shape, 0
-        reason = "the camera has ended"
         try:
-            for data in frames:
-                if self._ended.is_set():
-                    break
-                large = np.frombuffer(data, np.uint8).reshape(height, width, 3)
-                frame = Frame(scale_down(large, self._size), time.monotonic(), number)
-                number += 1
-                with self._lock:
-                    self._frame = frame
-                    self._lock.notify_all()
-        except Exception as error:
-            reason = f"the camera has failed: {str(error).splitlines()[0]}"
-        finally:
-            frames.close()
+            self.frame()
+        except BaseException as error:
+            self.close()
+            if isinstance(error, RobotError):
+                raise RobotError(f"the camera {source!r} cannot be read: {error}") from None
+            raise
+
+    def _read(self) -> None:
+        stream, number = self._process.stdout, 0
+        assert stream is not None
+        while (image := _read_ppm(stream)) is not None:
+            taken = time.monotonic()
+            frame = Frame(scale_down(image, self._size), taken, number)
+            number += 1
+            with self._lock:
+                self._frame = frame
+                self._lock.notify_all()
+        self._messages.seek(0)
+        said = self._messages.read().decode(errors="replace").split("\n")
+        said = [line for line in said if line.strip()]
         with self._lock:
-            self._error = reason
+            self._error = said[-1] if said else "it has ended"
             self._lock.notify_all()
 
     def frame(self) -> Frame:
-        """The newest image; the first call waits for it.
+        """The newest image.
 
         Raises:
-          RobotError: the camera has sent no image within its time, or has failed.
+          RobotError: the camera has not sent any.
         """
         with self._lock:
             self._lock.wait_for(lambda: self._frame is not None or self._error, _PATIENCE)
             if self._frame is None:
-                raise RobotError(self._error or "the camera is silent: it has sent no image")
-            # After its end the last image grows old, and the watchdog says so.
+                raise RobotError(self._error or "it has sent no image")
+            # After the end of the camera its last image grows old, and the watchdog says so.
             return self._frame
 
     def close(self) -> None:
         """Frees the camera."""
-        self._ended.set()
-        self._thread.join(_PATIENCE)
+        self._process.kill()
+        self._process.wait()
+        self._thread.join()
+        assert self._process.stdout is not None
+        self._process.stdout.close()
+        self._messages.close()
+
+
+def _read_ppm(stream: IO[bytes]) -> np.ndarray | None:
+    """The next image of a stream in the format PPM, `[H, W, 3] uint8`; None at its end."""
+    kind, size, most = (stream.readline().split() for _ in range(3))
+    if kind != [b"P6"] or len(size) != 2 or most != [b"255"]:
+        return None
+    width, height = map(int, size)
+    data = stream.read(width * height * 3)
+    if len(data) < width * height * 3:
+        return None
+    return np.frombuffer(data, np.uint8).reshape(height, width, 3)
 
 
 def scale_down(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:

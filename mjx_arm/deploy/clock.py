@@ -8,26 +8,26 @@ from typing import Protocol
 
 
 class Clock(Protocol):
-    """A clock that rises, and waits."""
+    """A monotonic clock that can wait."""
 
     def now(self) -> float:
         """The time, s."""
         ...
 
     def wait_until(self, when: float, stop: threading.Event) -> None:
-        """Returns at a time, or earlier where `stop` is set."""
+        """Returns at the time `when`, s, or as soon as `stop` is set."""
         ...
 
 
 class WallClock:
-    """`time.monotonic`, which the stand-in's client uses as well."""
+    """`time.monotonic`, which the stand-in's client and the camera use for their images as well."""
 
     def now(self) -> float:
         """The time, s."""
         return time.monotonic()
 
     def wait_until(self, when: float, stop: threading.Event) -> None:
-        """Returns at a time, or earlier where `stop` is set."""
+        """Returns at the time `when`, s, or as soon as `stop` is set."""
         left = when - time.monotonic()
         if left > 0:
             stop.wait(left)

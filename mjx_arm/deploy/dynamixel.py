@@ -13,14 +13,14 @@ from __future__ import annotations
 import functools
 import json
 import pathlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from types import TracebackType
 from typing import Annotated, Any
 
 import numpy as np
 from pydantic import Field
 
-from mjx_arm.deploy.robot import Frame, RobotError
+from mjx_arm.deploy.robot import Frame, RobotError, first_line
 from mjx_arm.options import Count, from_json, options
 
 # Control table: address and length in bytes.
@@ -45,12 +45,17 @@ _ERRORS = {
     4: "electrical shock",
     5: "overload",
 }
-# A transfer that fails is tried again this often: one byte in a million is wrong on a good line.
+# Attempts at a transfer: one byte in a million is wrong on a good line.
 _TRIES = 2
-# A joint that is this far behind its target has hit something, degrees.
+# A joint that is further behind its target than this has hit something, degrees.
 _MOST_BEHIND = 10.0
 
 ServoId = Annotated[int, Field(ge=0, le=252)]
+# Positions that the servos know: 256 turns in both directions.
+Ticks = Annotated[int, Field(ge=-(2**20) + 1, le=2**20 - 1)]
+# The largest limit of the current of an XM540-W270; a servo with a lower one rejects the value.
+Current = Annotated[int, Field(ge=1, le=2047)]
+Profile = Annotated[int, Field(ge=0, le=32767)]
 
 
 @options
@@ -61,14 +66,15 @@ class DynamixelConfig:
       port: serial device, such as `/dev/ttyUSB0`.
       baudrate: of the bus.
       joints: ids of the servos of the joints, in the order of the scene.
-      signs: 1 or -1: whether a rising angle of the scene is a rising position of the servo.
+      signs: for each joint 1 if the servo's position rises with the scene's angle, else -1.
       zeros: positions of the servos where the scene's angles are 0, ticks of 360/4096 degrees.
       gripper: id of the gripper's servo.
-      gripper_open: its position where the gripper is open, ticks.
-      gripper_closed: its position where the gripper would be shut, ticks.
+      gripper_open: its position when the gripper is open, ticks.
+      gripper_closed: its position when the gripper is shut, ticks.
       gripper_current: limit of its current in the current-based position mode, units of 2.69 mA.
-      profile_velocity: limit of the joints' speed, units of 0.229 rev/min; 0 for none.
-      profile_acceleration: limit of their acceleration, units of 214.577 rev/min2; 0 for none.
+      profile_velocity: limit of the joints' speed, units of 0.229 rev/min; 0 for no limit.
+      profile_acceleration: limit of the joints' acceleration, units of 214.577 rev/min2; 0 for no
+        limit.
       camera: path of a video device, or of a video.
     """
 
@@ -76,21 +82,21 @@ class DynamixelConfig:
     baudrate: Count = 1_000_000
     joints: tuple[ServoId, ...] = (1, 2, 4, 6, 7, 8)
     signs: tuple[int, ...] = (1, 1, 1, 1, 1, 1)
-    zeros: tuple[int, ...] = (2048, 2048, 2048, 2048, 2048, 2048)
+    zeros: tuple[Ticks, ...] = (2048, 2048, 2048, 2048, 2048, 2048)
     gripper: ServoId = 9
-    gripper_open: int
-    gripper_closed: int
-    gripper_current: Count = 200
-    profile_velocity: Annotated[int, Field(ge=0, le=32767)] = 60
-    profile_acceleration: Annotated[int, Field(ge=0, le=32767)] = 30
+    gripper_open: Ticks
+    gripper_closed: Ticks
+    gripper_current: Current = 200
+    profile_velocity: Profile = 60
+    profile_acceleration: Profile = 30
     camera: str = "/dev/video0"
 
     def check(self) -> None:
-        """Refuses lists of different lengths, and ids that occur twice."""
+        """Refuses lists that are empty or of different lengths, and ids that occur twice."""
         lengths = {len(x) for x in (self.joints, self.signs, self.zeros)}
-        if len(lengths) != 1:
+        if len(lengths) != 1 or not self.joints:
             raise ValueError(
-                f"joints, signs and zeros must have one value for each joint, got "
+                "joints, signs and zeros must have one value for each joint, and at least one, got "
                 f"{len(self.joints)}, {len(self.signs)} and {len(self.zeros)}"
             )
         if not set(self.signs) <= {1, -1}:
@@ -117,8 +123,8 @@ def read_config(path: pathlib.Path) -> DynamixelConfig:
 class DynamixelRobot:
     """Drives an arm of Dynamixel servos; see `Robot`. Use it in a `with` block.
 
-    When it is made it finds all servos, and makes them hold where they are. When it ends the servos
-    keep holding: without torque the arm would fall.
+    Making one turns the torque of all servos on, and they hold where they are. This also happens in
+    a dry run. At the end of the block they keep holding: without torque the arm would fall.
 
     Args:
       config: of the arm.
@@ -126,7 +132,8 @@ class DynamixelRobot:
       tries: attempts at a transfer.
 
     Raises:
-      RobotError: the port, a servo or its operating mode is not as it should be.
+      RobotError: the port cannot be opened, a servo does not answer or reports a fault, or its
+        operating mode is wrong.
       ValueError: dynamixel-sdk is not installed.
     """
 
@@ -159,8 +166,9 @@ class DynamixelRobot:
         try:
             opened = self._port.openPort()
         except Exception as error:  # pyserial's, and those of the system
-            reason = str(error).splitlines()[0]
-            raise RobotError(f"the port {self.config.port} cannot be opened: {reason}") from error
+            raise RobotError(
+                f"the port {self.config.port} cannot be opened: {first_line(error)}"
+            ) from error
         if not opened:
             raise RobotError(f"the port {self.config.port} has no rate of {self.config.baudrate}")
 
@@ -236,7 +244,8 @@ class DynamixelRobot:
             except RobotError as error:
                 failed.append(str(error))
         if failed:
-            raise RobotError("; ".join(failed))
+            # A port that has failed gives the same sentence for each servo.
+            raise RobotError("; ".join(dict.fromkeys(failed)))
 
     def disconnect(self) -> None:
         """Frees the port; the servos hold."""
@@ -308,8 +317,9 @@ class DynamixelRobot:
         try:
             return transfer()
         except Exception as error:  # pyserial's and the system's, where the cable is pulled
-            reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-            raise RobotError(f"the port {self.config.port} has failed: {reason}") from error
+            raise RobotError(
+                f"the port {self.config.port} has failed: {first_line(error)}"
+            ) from error
 
     def _ask(self, servo: int, name: str, *arguments: int, alert: bool = True) -> Any:
         """A transfer with one servo, by the name of the method of dynamixel-sdk."""
@@ -360,6 +370,3 @@ def _words(result: int) -> str:
         -3002: "its answer is damaged",
     }
     return words.get(result, f"error {result}")
-
-
-__all__: Sequence[str] = ["DynamixelConfig", "DynamixelRobot", "read_config"]

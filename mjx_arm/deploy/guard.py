@@ -12,15 +12,15 @@ from mjx_arm.deploy.robot import RobotError
 from mjx_arm.envs.arm import Arm
 from mjx_arm.scene import Scene
 
-# A servo may be this far out of its range, and an encoder this wrong, degrees.
+# How far a measured angle may be outside of the range of its joint, degrees.
 _TOLERANCE = 3.0
-# The default box: this far around the grasp site at home, and this far above the ground, m.
-_AROUND, _ABOVE, _UP = 0.5, 0.005, 0.7
+# The default box: distance to its sides from the grasp site at home, heights of its ends, m.
+_AROUND, _LOWEST, _HIGHEST = 0.5, 0.005, 0.7
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Guard:
-    """Checks the joints of an arm, and refuses steps that would lead it out of bounds.
+    """Checks the joints of an arm, and rejects steps that would lead it out of bounds.
 
     Attributes:
       limits: `[n, 2] float64`, lower and upper bounds of the joints, degrees.
@@ -47,10 +47,11 @@ class Guard:
             )
 
     def check(self, angles: object) -> np.ndarray:
-        """The angles, if an arm can have them.
+        """Returns the measured angles, degrees, if they are valid.
 
         Raises:
-          RobotError: another number of them, one is not finite, or out of its range.
+          RobotError: they are not an array `[n]`, or one is not finite, or is more than 3 degrees
+            outside of its range.
         """
         count = len(self.limits)
         if not isinstance(angles, np.ndarray) or angles.shape != (count,):
@@ -66,7 +67,7 @@ class Guard:
         return angles
 
     def refuses(self, angles: np.ndarray, joint: int, degrees: float) -> str | None:
-        """Why a step must not be carried out, or None.
+        """Why a step is rejected, as a sentence; None if it is allowed.
 
         Steps that lead back from beyond a bound are allowed.
 
@@ -114,14 +115,15 @@ def make_guard(scene: Scene, arm: Arm, workspace: tuple[float, ...] | None = Non
         metre around the grasp site at home, from 5 mm to 70 cm above the ground.
 
     Raises:
-      ValueError: the arm has slides, or the box has no volume.
+      ValueError: the arm has slides, or `workspace` is not six numbers of a box with a volume.
     """
     limits = np.rad2deg(arm.ctrl_range[arm.ctrl].astype(np.float64))
     if workspace is not None:
-        return Guard(limits, np.asarray(workspace, np.float64).reshape(-1, 3), scene, arm)
+        box = np.asarray(workspace, np.float64)
+        return Guard(limits, box.reshape(2, 3) if box.size == 6 else box, scene, arm)
     data = mujoco.MjData(scene.mj_model)
     data.qpos[:] = arm.home_qpos
     mujoco.mj_kinematics(scene.mj_model, data)
     x, y, _ = data.site_xpos[arm.grasp_site]
-    low, high = (x - _AROUND, y - _AROUND, _ABOVE), (x + _AROUND, y + _AROUND, _UP)
+    low, high = (x - _AROUND, y - _AROUND, _LOWEST), (x + _AROUND, y + _AROUND, _HIGHEST)
     return Guard(limits, np.asarray([low, high]), scene, arm)

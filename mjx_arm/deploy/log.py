@@ -1,7 +1,7 @@
-"""The log of a deployment: one JSON object a line, with every image, so that it can be replayed.
+"""The log of a deployment: one JSON object per line, with every image, so that it can be replayed.
 
-The first line says what ran, each further line is one tick, and the last one has `end`, why it
-ended. Lines are written whole.
+The first line says what ran. Each further line is one tick. The last line has `end`: why the run
+ended.
 """
 
 from __future__ import annotations
@@ -16,8 +16,6 @@ from types import TracebackType
 from typing import Any, TextIO
 
 import numpy as np
-
-from mjx_arm.policy import check_image
 
 FORMAT = "mjx_arm deploy 1"
 
@@ -42,7 +40,7 @@ class Log:
         if self._file is None:
             return
         values = {name: _plain(name, value) for name, value in record.items()}
-        # One write, so that no signal comes between.
+        # One write, so that no signal comes between two parts of a line.
         self._file.write(json.dumps(values) + "\n")
         self._file.flush()
 
@@ -83,8 +81,9 @@ class Recording:
 
     Attributes:
       header: what ran.
-      ticks: one record each, with its image as `[H, W, 3] uint8`.
-      end: why it ended.
+      ticks: a record for each tick, with `image`, `[H, W, 3] uint8` or `[C, H, W, 3] uint8`, and
+        `q`, `[A] float64`.
+      end: why the run ended.
     """
 
     header: dict[str, Any]
@@ -96,7 +95,7 @@ def read_log(path: pathlib.Path) -> Recording:
     """Reads a log.
 
     Raises:
-      ValueError: the file is missing or damaged, or it ends without the end of a run.
+      ValueError: the file is missing or damaged, or its last line is not the end of a run.
     """
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
@@ -116,23 +115,25 @@ def _read_line(path: pathlib.Path, number: int, line: str) -> dict[str, Any]:
         record = json.loads(line)
         if not isinstance(record, dict):
             raise ValueError("no object")
-        if "image" in record:
+        if "tick" in record:
             packed, shape = record["image"]["zlib"], record["image"]["shape"]
             data = zlib.decompress(base64.b64decode(packed, validate=True))
             record["image"] = np.frombuffer(data, np.uint8).reshape(shape)
-    except (ValueError, KeyError, TypeError, zlib.error) as error:
+            record["q"] = np.asarray(record["q"], np.float64)
+            record["best"] = int(record["best"])
+    except (ValueError, KeyError, TypeError, RecursionError, zlib.error) as error:
         raise ValueError(f"the log {path} is damaged at line {number}") from error
     return record
 
 
 @dataclasses.dataclass(frozen=True)
 class Replay:
-    """A log, thought over again by a policy.
+    """A policy's answers to the images of a log, compared with the logged ones.
 
     Attributes:
-      ticks: with an image that the policy was asked about.
-      same: those in which the policy chooses the same action again.
-      largest: largest difference of a Q-value.
+      ticks: number of ticks in the log.
+      same: number of ticks in which the policy's best action is the logged one.
+      largest: largest absolute difference of a Q-value.
       end: why the logged run ended.
     """
 
@@ -145,18 +146,22 @@ class Replay:
 def replay(path: pathlib.Path, policy: Callable[[np.ndarray], tuple[np.ndarray, int]]) -> Replay:
     """Gives the images of a log to a policy again, and compares Q-values and actions.
 
+    Args:
+      path: of the log.
+      policy: `image uint8 -> (Q-values [A] float32, best action)`, as `mjx_arm.policy.Policy`.
+
     Raises:
       ValueError: the log is damaged, or its images do not fit the policy.
     """
-    recording, same, largest = read_log(path), 0, 0.0
-    ticks = [tick for tick in recording.ticks if tick.get("q") is not None]
-    for tick in ticks:
-        check_image(tick["image"], tick["image"].shape)
+    recording, same = read_log(path), 0
+    differences = [0.0]
+    for tick in recording.ticks:
         q, action = policy(tick["image"])
-        if len(q) != len(tick["q"]):
+        if q.shape != tick["q"].shape:
             raise ValueError(
-                f"the log {path} has {len(tick['q'])} actions, and the policy {len(q)}"
+                f"the log {path} has {tick['q'].size} actions, and the policy {q.size}"
             )
         same += action == tick["best"]
-        largest = max(largest, float(np.abs(q - np.asarray(tick["q"])).max()))
-    return Replay(len(ticks), same, largest, recording.end)
+        differences.append(np.abs(q - tick["q"]).max())
+    # Not Python's max, which may lose NaN.
+    return Replay(len(recording.ticks), same, float(np.max(differences)), recording.end)

@@ -48,13 +48,13 @@ class LoopConfig:
     """Options of the control loop.
 
     Attributes:
-      rate: actions a second. Training has 50 to a second of physics: at 25 the arm moves at half
-        of its speed.
-      seconds: how long it runs at most.
+      rate: actions per second. Training has 50 per second of physics: at 25 the arm moves half as
+        fast as in training.
+      seconds: the loop ends after this time, s.
       epsilon: share of random actions.
-      degrees: step of a joint.
-      watchdog: the robot is stopped where the newest image is older than this, s.
-      dry_run: nothing is sent to the robot, not even the stop.
+      degrees: step of a joint, degrees.
+      watchdog: the robot is stopped if the newest image is older than this, s.
+      dry_run: the loop sends nothing to the robot, not even the stop.
       seed: of the random actions.
     """
 
@@ -74,11 +74,11 @@ class Outcome:
     Attributes:
       ending: `done` (time is up, or `until` was true), `stopped` (by the user) or `fault`.
       reason: one sentence.
-      ticks: actions that were chosen.
+      ticks: number of complete ticks; one in which the robot fails is not complete.
       misses: ticks that were not over before the next one was due.
       refused: actions that the guard did not let through.
-      inference_ms: `[ticks] float64`, time of the policy.
-      image_age_ms: `[ticks] float64`, age of the image when the action was sent.
+      inference_ms: `[ticks] float64`, time of the policy, ms.
+      image_age_ms: `[ticks] float64`, age of the image when the action was sent, ms.
     """
 
     ending: Ending
@@ -112,8 +112,8 @@ def run_loop(
     """Drives a robot by a policy until the time is up, something fails, or the user stops it.
 
     A tick: newest image, joint angles, Q-values, action, guard, command. What the robot reports is
-    checked before it is used. A tick that is late counts as a miss, and the ticks that are due
-    meanwhile are left out. The end of the loop is logged whatever it is.
+    checked before it is used. A late tick counts as a miss, and the ticks that were due meanwhile
+    are skipped. However the loop ends, the robot is told to stop and the log gets a last line.
 
     Args:
       robot: to drive.
@@ -122,11 +122,14 @@ def run_loop(
       config: rate, time and so on.
       log: gets every tick, and the end.
       clock: by default the real one.
-      stop: ends the loop within a tick where it is set; see `stop_on_signals`.
-      until: ends the loop where it is true.
+      stop: ends the loop within a tick when it is set; see `stop_on_signals`.
+      until: is called before each tick; the loop ends when it returns true.
+
+    Returns:
+      How the loop ended. A failure of the robot is an outcome with the ending `fault`.
 
     Raises:
-      ValueError: policy and guard do not fit together.
+      ValueError: policy and guard are of different numbers of joints.
     """
     joints = len(guard.limits)
     if policy.num_actions != 2 * joints + 2:
@@ -161,9 +164,11 @@ class _Loop:
             reason = f"the loop has failed: {type(error).__name__}"
             raise
         finally:
-            reason = self._stop_robot(reason)
-            with contextlib.suppress(OSError):  # a full disk has ended the loop already
-                self.log.write(self._last_line(ending, reason))
+            try:
+                reason = self._stop_robot(reason)
+            finally:
+                with contextlib.suppress(OSError):  # a full disk has ended the loop already
+                    self.log.write(self._last_line(ending, reason))
         tally = self.tally
         ages, times = np.asarray(tally.image_age_ms), np.asarray(tally.inference_ms)
         return Outcome(ending, reason, len(times), tally.misses, tally.refused, times, ages)
@@ -191,7 +196,7 @@ class _Loop:
         angles = self.guard.check(self.robot.joint_angles())
         thinks = clock.now()
         q, best = self.policy(frame.image)
-        tally.inference_ms.append(1000 * (clock.now() - thinks))
+        inference_ms = 1000 * (clock.now() - thinks)
         action, refused = self._choose(best), None
         if action < 2 * len(angles):
             refused = self.guard.refuses(angles, action // 2, self._step(action))
@@ -199,6 +204,7 @@ class _Loop:
             self._send(action)
         sent = clock.now()
         tally.refused += refused is not None
+        tally.inference_ms.append(inference_ms)
         tally.image_age_ms.append(1000 * (sent - frame.time))
         late = sent > deadline
         tally.misses += late
@@ -208,7 +214,7 @@ class _Loop:
                 "time": began,
                 "image_number": frame.number,
                 "image_age_ms": tally.image_age_ms[-1],
-                "inference_ms": tally.inference_ms[-1],
+                "inference_ms": inference_ms,
                 "angles": angles,
                 "q": q,
                 "best": best,
@@ -254,7 +260,12 @@ class _Loop:
         if self.config.dry_run:
             return reason
         try:
-            self.robot.stop()
+            try:
+                self.robot.stop()
+            except KeyboardInterrupt:
+                # A second Ctrl-C may come between two joints.
+                self.robot.stop()
+                raise
         except RobotError as error:
             if str(error) != reason:
                 return f"{reason}; the robot could not be told to stop: {error}"
@@ -290,10 +301,10 @@ def describe_outcome(outcome: Outcome) -> dict[str, Any]:
 
 @contextlib.contextmanager
 def stop_on_signals() -> Iterator[threading.Event]:
-    """An event that Ctrl-C and SIGTERM set, in the `with` block; for the main thread.
+    """An event that Ctrl-C and SIGTERM set while the `with` block runs; for the main thread.
 
-    The loop ends within a tick, stops the robot and finishes its log. A second Ctrl-C waits for
-    nothing: it raises KeyboardInterrupt, after which the robot is still told to stop.
+    The loop then ends within a tick, stops the robot and finishes its log. A second signal raises
+    KeyboardInterrupt at once; the robot is still told to stop.
     """
     stop = threading.Event()
 

@@ -1,4 +1,4 @@
-"""What a robot is to the control loop: a camera, joints in degrees, and a gripper."""
+"""What the control loop needs of a robot: a camera, joints in degrees, and a gripper."""
 
 from __future__ import annotations
 
@@ -10,6 +10,11 @@ import numpy as np
 
 class RobotError(ValueError):
     """The robot, its camera or the line to it has failed; the message is one sentence."""
+
+
+def first_line(error: Exception) -> str:
+    """The first line of an error's message, or the name of its type if the message is empty."""
+    return (str(error).splitlines() or [type(error).__name__])[0]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -28,7 +33,7 @@ class Frame:
 
 
 class Robot(Protocol):
-    """An arm of n hinges with a gripper. Every method may raise `RobotError`."""
+    """An arm of n hinges with a gripper and a camera. Every method may raise `RobotError`."""
 
     def frame(self) -> Frame:
         """The newest image, at once; the first call waits until there is one."""

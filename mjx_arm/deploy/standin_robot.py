@@ -15,6 +15,7 @@ import numpy as np
 from mjx_arm.deploy.robot import Frame, RobotError
 from mjx_arm.deploy.wire import LOOPBACK, ClosedError, GarbageError, receive, send
 
+# The stand-in greets, sends its first image and resets within this time, s.
 _PATIENCE = 5.0
 
 
@@ -27,12 +28,13 @@ class StandInRobot:
       port: of the stand-in.
 
     Attributes:
-      hello: what it has said of itself: `joints`, `step` in degrees, number of `starts`.
+      hello: what the stand-in says of itself: names of the `joints`, `step` in degrees, number of
+        `starts`.
       received: number of images that have arrived.
-      sent: number of images that it has taken; the others were lost.
+      sent: number of images that the stand-in has taken since the first one that arrived.
 
     Raises:
-      RobotError: nothing listens there, or it is another thing, or another client is there.
+      RobotError: nothing listens there, or not a stand-in, or it has another client already.
     """
 
     def __init__(self, port: int) -> None:
@@ -110,7 +112,17 @@ class StandInRobot:
                 raise RobotError("the stand-in reports no joint angles") from error
 
     def measured(self, name: str) -> Any:
-        """What the stand-in knows and a real arm does not: `success`, `grasped`, `episode`."""
+        """What the stand-in knows and a real arm does not.
+
+        Args:
+          name: `success` or `grasped`, bool, or `episode`, the number of resets.
+
+        Returns:
+          The value that came with the newest image; None before the first.
+
+        Raises:
+          RobotError: the connection has ended.
+        """
         with self._lock:
             self._check()
             return self._state.get(name)
@@ -132,7 +144,14 @@ class StandInRobot:
         self._command(kind="stop")
 
     def reset(self, start: int) -> None:
-        """Puts arm and cube to a start, as a person would, and waits until it is seen."""
+        """Puts arm and cube to a start, and waits until an image shows it.
+
+        Args:
+          start: 0 to `hello["starts"] - 1`.
+
+        Raises:
+          RobotError: the stand-in does not do so within 5 s, or the connection has ended.
+        """
         with self._lock:
             self._check()
             episode = self._state.get("episode", 0)
@@ -183,8 +202,11 @@ def _frame(state: dict[str, Any], data: bytes, arrived: float) -> Frame:
       GarbageError: it has none.
     """
     shape, number = state.get("shape"), state.get("number")
-    whole = isinstance(shape, list) and all(type(x) is int and x > 0 for x in shape)
-    if not whole or not isinstance(shape, list) or math.prod(shape) != len(data):
+    if (
+        not isinstance(shape, list)
+        or not all(type(x) is int and x > 0 for x in shape)
+        or math.prod(shape) != len(data)
+    ):
         raise GarbageError("the stand-in sends an image of another size than it says")
     if type(number) is not int:
         raise GarbageError("the stand-in sends an image without a number")

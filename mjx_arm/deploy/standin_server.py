@@ -10,7 +10,6 @@ from __future__ import annotations
 import collections
 import contextlib
 import dataclasses
-import math
 import multiprocessing
 import os
 import pickle
@@ -33,10 +32,11 @@ from mjx_arm.standin.levels import Offsets
 from mjx_arm.standin.opengl import opengl_for_children
 from mjx_arm.standin.world import StandIn
 
-# A process that is behind by more than this leaves time out, iterations.
+# A process that lags by more iterations than this skips time instead of catching up.
 _MOST_BEHIND = 10
 # A client that takes nothing for this long is gone, s.
 _PATIENCE = 2.0
+# A process that is not ready after this long has failed, s.
 _STARTS_WITHIN = 120.0
 
 
@@ -61,10 +61,10 @@ class Server:
         try:
             # Loopback alone: whoever reaches the socket moves the arm.
             self._listener.bind((LOOPBACK, port))
+            self._listener.listen(4)
         except (OSError, OverflowError) as error:
             self._listener.close()
             raise ValueError(f"port {port} of {LOOPBACK} cannot be listened on: {error}") from error
-        self._listener.listen(4)
         self.port: int = self._listener.getsockname()[1]
         self._lock = threading.Condition()
         self._client: _Client | None = None
@@ -88,6 +88,9 @@ class Server:
 
     def close(self) -> None:
         """Stops listening, and ends the connection."""
+        # On Linux close alone does not wake the thread in `accept`, and the port stays open.
+        with contextlib.suppress(OSError):
+            self._listener.shutdown(socket.SHUT_RDWR)
         self._listener.close()
         with self._lock:
             if self._client is not None:
@@ -147,12 +150,13 @@ class Server:
             wrong = str(error)
         except ClosedError:
             pass
-        with self._lock:
-            self._commands.append({"kind": "stop"})
-            self._client = None
-            if client.goodbye is None:
-                client.goodbye = f"{wrong}: the arm has stopped" if wrong else ""
-            self._lock.notify_all()
+        finally:
+            with self._lock:
+                self._commands.append({"kind": "stop"})
+                self._client = None
+                if client.goodbye is None:
+                    client.goodbye = f"{wrong}: the arm has stopped" if wrong else ""
+                self._lock.notify_all()
 
 
 @dataclasses.dataclass(eq=False)
@@ -183,7 +187,7 @@ def invalid_command(command: dict[str, Any], hello: dict[str, Any]) -> str:
         joint, degrees, step = command.get("joint"), command.get("degrees"), hello["step"]
         if type(joint) is not int or not 0 <= joint < len(hello["joints"]):
             return f"a command names the joint {joint!r}"
-        if not isinstance(degrees, int | float) or not math.isclose(abs(degrees), step):
+        if type(degrees) not in (int, float) or abs(degrees) != step:
             return f"a command moves a joint by {degrees!r} degrees instead of {step:g}"
         return ""
     if kind == "reset":
@@ -256,8 +260,9 @@ def _serve(job: bytes, parent: int, ready: Connection) -> None:
     try:
         env, offsets, starts, port = pickle.loads(job)
         world = StandIn(env, offsets)
+        # Compiles; the server then resets the world.
         world.reset(starts[0].qpos, starts[0].ctrl)
-        world.command(env.arm.open_action if world.ctrl[env.arm.gripper_ctrl] else 0)  # compiles
+        world.command(0)
         world.measure()
         server = Server(make_hello(env, starts), port)
     except ValueError as error:
@@ -294,10 +299,11 @@ class StandInProcess:
         with opengl_for_children():
             self.process.start()
         other.close()
-        try:
-            said = ready.recv() if ready.poll(_STARTS_WITHIN) else "it does not start"
-        except EOFError:
-            said = "its process has ended"
+        with ready:
+            try:
+                said = ready.recv() if ready.poll(_STARTS_WITHIN) else "it does not start"
+            except EOFError:
+                said = "its process has ended"
         if not isinstance(said, int):
             self.close()
             raise ValueError(f"the stand-in cannot run: {said}")

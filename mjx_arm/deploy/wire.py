@@ -53,7 +53,7 @@ def receive(sock: socket.socket) -> tuple[dict[str, Any], bytes]:
     text, data = _read(sock, text_size), _read(sock, size)
     try:
         values = json.loads(text)
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise GarbageError("garbage came over the socket") from error
     if not isinstance(values, dict) or not isinstance(values.get("kind"), str):
         raise GarbageError("a message without a kind came over the socket")

@@ -44,7 +44,7 @@ from mjx_arm.render.surface import (
 )
 from mjx_arm.render.texture import (
     Atlas,
-    Papers,
+    Materials,
     Skin,
     apply_textures,
     look_up,
@@ -331,14 +331,14 @@ def _paint(
         return colour
     assert plan.atlas is not None
     model, varies = plan.spec.model, plan.spec.varies
-    papers = Papers(
+    materials = Materials(
         fill(model, varies, params, "mat_texture"), fill(model, varies, params, "mat_texrepeat")
     )
     members = np.zeros(model.ngeom, bool)
     members[[skin.geom for skin in skins]] = True
     nearest = cast(geom_groups(model, members), poses, setting, empty_surface(setting))
     depth, _ = _depth(nearest)
-    texels = look_up(nearest.unlit >> 24, depth, setting, poses, skins, plan.atlas, papers)
+    texels = look_up(nearest.unlit >> 24, depth, setting, poses, skins, plan.atlas, materials)
     return apply_textures(colour, skins, texels)
 
 

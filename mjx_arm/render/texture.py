@@ -57,7 +57,10 @@ class Atlas:
 
 
 def make_atlas(mj_model: mujoco.MjModel) -> Atlas:
-    """Collects the textures of a model; those that cannot be rendered are left out."""
+    """Collects the textures of a model; those that cannot be rendered are left out.
+
+    The rows of a texture that is left out have no meaning.
+    """
     pieces: list[np.ndarray] = []
     start, stride, levels = (np.zeros(mj_model.ntex, np.int32) for _ in range(3))
     size = 0
@@ -155,11 +158,11 @@ def make_skins(mj_model: mujoco.MjModel, members: np.ndarray) -> list[Skin]:
     ]
 
 
-class Papers(NamedTuple):
-    """What the materials have by episode.
+class Materials(NamedTuple):
+    """The textures of the materials in an episode.
 
     Attributes:
-      texture: `[nmat] float32`, ids of their textures.
+      texture: `[nmat] float32`, the id of each material's texture.
       repeat: `[nmat, 2] float32`, as `mat_texrepeat` of the model.
     """
 
@@ -210,7 +213,7 @@ def look_up(
     poses: GeomPoses,
     skins: list[Skin],
     atlas: Atlas,
-    papers: Papers,
+    materials: Materials,
 ) -> Texels:
     """Looks the textures up at every pixel.
 
@@ -221,11 +224,14 @@ def look_up(
       poses: of all geoms.
       skins: the textured geoms, at least one.
       atlas: the textures.
-      papers: which texture each material has, and how often it repeats.
+      materials: which texture each material has, and how often it repeats.
+
+    Returns:
+      The texels of each pixel; without meaning where `geom` is none of `skins`.
     """
     chosen: _Lookup | None = None
     for skin in skins:
-        found = _look(skin, depth, setting, poses, atlas, papers)
+        found = _look(skin, depth, setting, poses, atlas, materials)
         here = geom == jnp.uint32(skin.geom)
         chosen = found if chosen is None else _where(here, found, chosen)
     assert chosen is not None
@@ -255,7 +261,7 @@ def _look(
     setting: Setting,
     poses: GeomPoses,
     atlas: Atlas,
-    papers: Papers,
+    materials: Materials,
 ) -> _Lookup:
     """Where each pixel would look if it showed this geom."""
     xpos, xmat = poses.xpos[skin.geom], poses.xmat[skin.geom]
@@ -264,11 +270,11 @@ def _look(
     size = jnp.asarray(setting.sizes[skin.geom], jnp.float32)
     # An infinite plane has the size 0, and repeats its texture by metres.
     inverse = 1 / jnp.where(size > 0, size, jnp.ones_like(size))
-    repeat = jnp.asarray(papers.repeat[skin.material], jnp.float32) / 2
+    repeat = jnp.asarray(materials.repeat[skin.material], jnp.float32) / 2
     repeat = repeat / inverse[:2] if skin.uniform else repeat
     begin = jnp.where(size[:2] > 0, repeat, -0.5)
-    # As floats, which a fence holds; they are exact up to 16 million texels.
-    number = jnp.asarray(papers.texture[skin.material]).astype(jnp.int32)
+    # As floats, because a fence has no effect on integers; they are exact up to 16 million texels.
+    number = jnp.asarray(materials.texture[skin.material]).astype(jnp.int32)
     tables = [
         jnp.asarray(table, jnp.float32)[number]
         for table in (atlas.start, atlas.levels, atlas.stride)
@@ -378,14 +384,19 @@ def _sample(look: _Lookup, depth: jax.Array, setting: Setting, atlas: Atlas) -> 
 
 
 class _Word(NamedTuple):
-    """How a place and all that is needed to read around it are in one uint32: numbers of bits."""
+    """Layout of the uint32 by which a pixel's place in the atlas goes from one kernel to the next.
+
+    Attributes:
+      place: bits of the index of the upper left texel.
+      share: bits of each of the two shares.
+    """
 
     place: int
     share: int
 
 
 def _word_of(atlas: Atlas) -> _Word:
-    # No place has all bits set, so that no word is the one that `materialize` takes for none.
+    # No place has all bits set, so no word is the value that `materialize` takes for impossible.
     place = len(atlas.texels).bit_length()
     # Four bits are log2 of the edge, one says whether the texture repeats.
     return _Word(place, min(8, (32 - 5 - place) // 2))

@@ -427,7 +427,7 @@ def _failures(plan: Plan, found: Measured) -> Iterator[Block]:
 
 
 def _where(columns: dict[str, Any]) -> str:
-    """In words, the half of the places with fewer successes."""
+    """Success in each half of the cube's places, in words."""
     cubes = np.asarray(columns["cube"], float)
     success = np.asarray(columns["success"], bool)
     parts = []

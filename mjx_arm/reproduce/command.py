@@ -39,7 +39,7 @@ def reproduce(
       shipped: show the agents that come with the package where `runs` has none.
       quick: tiny trainings and few episodes, to prove the path.
       only: sections or cells to measure; by default everything but the long studies.
-      seeds: of each agent that is trained.
+      seeds: number of seeds of each agent that is trained.
       console: where it prints; by default nowhere.
 
     Returns:
@@ -64,12 +64,13 @@ def reproduce(
     _say_hours(trainings, console)
     for training in trainings:
         run_training(training, plan.run_folder(training), console)
-    # Again: there are agents now that were not there.
+    # Again: now there are the agents that were just trained.
     plan = make_plan(out, **options)
     for cell in plan.cells:
         if plan.is_chosen(cell.name, cell.section) and plan.read(cell.name) is None:
             _measure(plan, cell, console)
-    page = write_pages(plan)
+    # Once more: after the last ablation in A those in B are known.
+    page = write_pages(make_plan(out, **options))
     console.print(f"page: {page}", soft_wrap=True)
     return page
 

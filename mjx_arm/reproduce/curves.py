@@ -11,7 +11,7 @@ import numpy as np
 
 from mjx_arm.report.metrics import read_metrics
 
-# Success is regular from where half of so many episodes in a row end in success.
+# Success is regular from the first 100 episodes in a row of which half end in success.
 REGULAR_EPISODES, REGULAR_RATE = 100, 0.5
 # Points of a curve in a file.
 _MOST_POINTS = 300
@@ -69,7 +69,7 @@ def regular_from(
     successes: Sequence[float] | np.ndarray,
     env_steps: Sequence[float] | np.ndarray,
 ) -> dict[str, int] | None:
-    """Where success becomes regular: half of the last 100 or more episodes ended in success.
+    """Where success becomes regular: half of at least 100 episodes in a row end in success.
 
     Args:
       episodes: that ended in each chunk.
@@ -77,7 +77,7 @@ def regular_from(
       env_steps: after each chunk.
 
     Returns:
-      `episode` and `env_steps` at the start of the first such episodes; None where there are none.
+      `episode` and `env_steps` at the start of the first such episodes; None if there are none.
     """
     ends, wins = np.cumsum(episodes), np.cumsum(successes)
     for last in range(len(ends)):

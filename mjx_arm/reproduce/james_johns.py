@@ -9,5 +9,3 @@ SUCCESSES = {("A", "A"): 28, ("B", "A"): 32, ("A", "B"): 1, ("B", "B"): 26}
 REGULAR_EPISODE = 1_800
 # Steps of the one successful episode whose Q-values they show.
 EPISODE_LENGTH = 112
-# Iterations until their schedule of epsilon ends, as the preset `paper` reads it.
-ITERATIONS = 1_000_000

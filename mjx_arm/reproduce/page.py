@@ -104,7 +104,7 @@ def _head(plan: Plan) -> Iterator[Block]:
     longer = ("pixels", "reward", "paper", "ablations", "ablations-B")
     yield Command(
         (
-            " ".join(["mjx-arm reproduce", *plan.options]),
+            plan.command(),
             *(f"{plan.command(name)}  # {SECTIONS[name]}" for name in longer),
         )
     )

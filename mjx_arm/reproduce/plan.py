@@ -41,7 +41,7 @@ from mjx_arm.reproduce.trials import (
 from mjx_arm.scene import read_source, scene_exists
 from mjx_arm.training.agent import BEST, LAST
 
-# Parts of the page. The first ones are made by default, the others are long and must be asked for.
+# Parts of the page. Those in `_BY_DEFAULT` are made by default, the others must be asked for.
 SECTIONS = {
     "agents": "agents A and B by the default preset",
     "figure1": "the scenes",
@@ -57,7 +57,6 @@ SECTIONS = {
     "page": "nothing is measured, the page alone is written again",
 }
 _BY_DEFAULT = ("agents", "figure1", "figure2", "figure3", "episodes", "figure4")
-_STUDIES = ("reward", "paper", "ablations")
 # Of the ablations, those that `--quick` tries.
 _QUICK_ABLATIONS = (DEFAULT, "n-step", "size")
 _ENVS = ("A", "B")
@@ -71,7 +70,8 @@ class Cell:
       name: of the file.
       section: one of `SECTIONS`.
       measure: returns the figures and the pictures.
-      inputs: returns what it is measured of: a JSON object. ValueError where that is not there.
+      inputs: returns what is measured, and how, as a JSON object; raises ValueError if the agent or
+        the run is not there.
       training: the run that it needs, or None.
     """
 
@@ -92,7 +92,7 @@ class Plan:
       options: of the command, without those that choose cells.
       subjects: its agents.
       cells: in the order of the page.
-      trainings: all that it may need.
+      trainings: all trainings that it may need.
       chosen: names of the sections and cells to measure.
     """
 
@@ -109,15 +109,16 @@ class Plan:
         return self.store.folder / RUNS / training.name
 
     def command(self, *names: str) -> str:
-        """The command that fills sections or cells."""
-        return shlex.join(["mjx-arm", "reproduce", "--only", *names, *self.options])
+        """The command that fills sections or cells, or the whole page if none is named."""
+        only = ["--only", *names] if names else []
+        return shlex.join(["mjx-arm", "reproduce", *only, *self.options])
 
     def is_chosen(self, name: str, section: str) -> bool:
         """Whether a cell or a training is to be made now."""
         return name in self.chosen or section in self.chosen
 
     def read(self, name: str) -> Measured | None:
-        """The file of a cell, as long as it is of the agent and the options of this plan.
+        """The file of a cell; None if there is none of the agent and the options of this plan.
 
         Raises:
           ValueError: the file is damaged.
@@ -174,7 +175,7 @@ def make_plan(
       shipped: show the agents that come with the package where the runs have none.
       quick: tiny trainings and few episodes, to prove the path.
       only: sections or cells to measure; empty for those that are made by default.
-      seeds: of each agent that is trained.
+      seeds: number of seeds of each agent that is trained.
 
     Raises:
       ValueError: a name in `only` is unknown, or there is no run folder.
@@ -222,7 +223,7 @@ def _options(
 def _with_own(
     subjects: Sequence[Subject], store: Store, trainings: Sequence[Training], trains: bool
 ) -> list[Subject]:
-    """The agents together with those that are trained for the page, also before they are."""
+    """The agents, and those that are trained for the page, also before they are trained."""
     found = {subject.key[:2] for subject in subjects}
     own = []
     for training in trainings:

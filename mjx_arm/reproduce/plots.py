@@ -219,7 +219,8 @@ def draw_joints(columns: Mapping[str, Any], noise: float) -> bytes:
                 own.plot([middle, middle], [100 * low, 100 * high], color="0.35", lw=1.5)
                 own.plot(middle, 100 * here.mean(), "s", color=COLOURS[0], ms=5)
         own.axhline(100 * success.mean(), color="black", lw=0.8, ls=":")
-        _label(own, f"joint {i + 1}", "degrees from home", "success, %" if i % 3 == 0 else "")
+        left = i % axes.shape[1] == 0
+        _label(own, f"joint {i + 1}", "degrees from home", "success, %" if left else "")
     for own in axes.ravel():
         own.set_ylim(max(0.0, least - 3), 103)
     return to_svg(figure, "joints")

@@ -17,11 +17,10 @@ from mjx_arm.envs.auto_reset import AutoReset, AutoResetState
 from mjx_arm.envs.env import Env
 from mjx_arm.options import Count, check_value
 from mjx_arm.physics import compiler_options
-from mjx_arm.training.evaluate import Apply
+from mjx_arm.training.evaluate import MAX_ENVS, Apply
 from mjx_arm.varies import Params
 
-# Environments side by side, as in the evaluation, and steps of one compiled call.
-MOST_ENVS = 200
+# Steps of one compiled call.
 _CHUNK = 100
 # What the task `lift` measures.
 MEASURED = ("grasped", "height", "distance")
@@ -82,9 +81,12 @@ def roll_out(
       env: of the task `lift`, made with the observation that the network wants.
       apply: `(params, obs [N, ...]) -> Q-values [N, A]`.
       params: of the network.
-      episodes: how many.
+      episodes: number of episodes.
       epsilon: share of random actions.
       key: consumed.
+
+    Returns:
+      The episodes, the first ones of all environments before the second ones.
 
     Raises:
       ValueError: another task, `episodes` below 1, or `epsilon` outside 0 to 1.
@@ -93,7 +95,7 @@ def roll_out(
     check_epsilon(epsilon)
     if env.config.task != "lift":
         raise ValueError(f"rollouts are recorded of the task 'lift', got {env.config.task!r}")
-    auto, num_envs = AutoReset(env), min(episodes, MOST_ENVS)
+    auto, num_envs = AutoReset(env), min(episodes, MAX_ENVS)
     quota = np.full(num_envs, episodes // num_envs)
     quota[: episodes % num_envs] += 1
 
@@ -101,7 +103,7 @@ def roll_out(
         step = functools.partial(_step, auto, apply, params, epsilon)
         return jax.lax.scan(step, run, None, _CHUNK)
 
-    # Of all agents and epsilons in one environment one program: a compilation cache finds it again.
+    # All agents and epsilons share one program per environment, so a compilation cache finds it.
     advance = jax.jit(record_chunk, compiler_options=compiler_options(env.physics))
     run = jax.jit(functools.partial(_start, auto))(key, jnp.asarray(quota, jnp.int32))
     chunks = []

@@ -19,7 +19,7 @@ class Measured:
     Attributes:
       name: of the cell.
       command: that wrote it.
-      inputs: what it was measured of and how: another agent or other options are another cell.
+      inputs: what was measured, and how; with another agent or other options the file is void.
       result: the figures.
       pictures: file names in `pictures/`.
       machine: that it was measured on.
@@ -63,7 +63,7 @@ class Store:
                 ) from error
 
     def read(self, name: str) -> Measured | None:
-        """A cell's file; None where there is none, or a picture of it is missing.
+        """A cell's file; None if there is none, or if a picture of it is missing.
 
         Raises:
           ValueError: the file is damaged.
@@ -82,7 +82,12 @@ class Store:
         return found if complete else None
 
     def write(self, measured: Measured, pictures: Mapping[str, bytes]) -> None:
-        """Writes a cell: its pictures first, so that a file says that all of it is there."""
+        """Writes a cell: its pictures first, so that where its file is they are there too.
+
+        Raises:
+          ValueError: a figure is infinite or NaN.
+          OSError: the disk does not take the files.
+        """
         for name, content in pictures.items():
             _write(self.folder / PICTURES / name, content)
         values = {"format": FORMAT, **dataclasses.asdict(measured)}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 from collections.abc import Iterator
 from typing import Any
 
@@ -35,15 +36,14 @@ def reward(plan: Plan) -> Iterator[Block]:
 
 
 def _of_reward(plan: Plan, name: str) -> list[Measured]:
-    names = [f"reward-{name}-seed{seed}" for seed in range(100)]
-    known = {cell.name for cell in plan.cells}
-    return [x for each in names if each in known and (x := plan.read(each)) is not None]
+    names = [cell.name for cell in plan.cells if cell.name.startswith(f"reward-{name}-seed")]
+    return [found for each in names if (found := plan.read(each)) is not None]
 
 
 def _reward_figures(found: dict[str, list[Measured]]) -> Iterator[Block]:
     yield Table(
         ("reward", "hovering is worth", "success is worth", "so it pays to", "mean Q reached"),
-        tuple(_worth(name, cells[0].result, cells) for name, cells in found.items()),
+        tuple(_worth(name, cells) for name, cells in found.items()),
     )
     rows = []
     for name, cells in found.items():
@@ -92,7 +92,8 @@ def _share(part: int, whole: int) -> float:
     return part / whole if whole else float("nan")
 
 
-def _worth(name: str, result: dict[str, Any], cells: list[Measured]) -> tuple[str, ...]:
+def _worth(name: str, cells: list[Measured]) -> tuple[str, ...]:
+    result = cells[0].result
     worth = result["worth"]
     hover, success = worth["hovering_for_ever"], worth["success"]
     reached = [x for cell in cells if (x := _last_q(cell.result["curve"])) is not None]
@@ -259,6 +260,7 @@ def transfer(plan: Plan) -> Iterator[Block]:
             rows.append((level, percent(values["rate"]), interval(*values["ci95"])))
             files.append(file)
         except (ValueError, KeyError, TypeError):
+            # It is damaged, or the command was interrupted.
             missing.append(level)
     if rows:
         yield Table(("level", "success", "95 % interval"), tuple(rows))
@@ -266,15 +268,14 @@ def transfer(plan: Plan) -> Iterator[Block]:
     if missing:
         folder = plan.store.folder / CELLS
         yield Missing(
-            f"Success in the stand-in for reality at {', '.join(missing)}. The command comes with "
-            "the desk scene.",
+            f"Success in the stand-in for reality at {', '.join(missing)}. Not measured yet.",
             "\n".join(
                 f"mjx-arm transfer AGENT --level {level} --episodes 200 --json "
-                f"> {folder}/transfer-{level}.json"
+                f"> {shlex.quote(f'{folder}/transfer-{level}.json')}"
                 for level in missing
             ),
         )
     yield Text(
-        "Figure 5, the feature maps of each layer in simulation and in the stand-in, comes with "
-        "the same command and is missing."
+        "Figure 5, the feature maps of each layer in simulation and in the stand-in, is not on "
+        "this page. `python benchmarks/feature_maps.py AGENT --out FOLDER` makes it."
     )

@@ -73,10 +73,12 @@ def find_runs(folder: pathlib.Path) -> list[Subject]:
     if (folder / CONFIG).is_file():
         return list(_subjects_of(folder))
     if not folder.is_dir():
-        raise ValueError(f"--runs {folder} is not a folder: give a run folder, or one of them")
+        raise ValueError(
+            f"--runs {folder} is not a folder: give a run folder, or a folder of run folders"
+        )
     runs = sorted(path.parent for path in folder.glob(f"*/{CONFIG}"))
     if not runs:
-        raise ValueError(f"--runs {folder} holds no run folder: none in it has a {CONFIG}")
+        raise ValueError(f"--runs {folder} holds no run folder: no folder in it has a {CONFIG}")
     return [subject for run in runs for subject in _subjects_of(run)]
 
 

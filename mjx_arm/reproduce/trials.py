@@ -45,7 +45,7 @@ class Trial:
 
     Attributes:
       env: `A` or `B`.
-      episodes: how many.
+      episodes: number of episodes.
       epsilon: share of random actions.
       max_steps: iterations until an episode is truncated.
     """
@@ -57,7 +57,15 @@ class Trial:
 
 
 def trial_inputs(agent: str, trial: Trial) -> dict[str, Any]:
-    """What a trial is of: the agent's file by its digest, and the options."""
+    """What a trial depends on, as a JSON object: the digest of the agent's file, and the options.
+
+    Args:
+      agent: what `load_agent` takes.
+      trial: how the agent is tried.
+
+    Raises:
+      ValueError: there is no such agent.
+    """
     content = find_agent(pathlib.Path(agent)).read_bytes()
     return {
         "agent_sha256": hashlib.sha256(content).hexdigest(),
@@ -100,7 +108,7 @@ def measure_episodes(name: str, path: str, trial: Trial, *, pictures: bool) -> R
         "trained_in": agent.trained_env.env,
         "rectangle": agent.env.scene.numbers("cube_rectangle", 4).tolist(),
         "noise_degrees": agent.env.config.noise_degrees,
-        "causes": {name: sum(cause_of(x) == name for x in rollouts) for name in CAUSES},
+        "causes": {cause: sum(cause_of(x) == cause for x in rollouts) for cause in CAUSES},
         "opens": count_opens(rollouts, agent.env.arm.open_action),
         "heights": height_histogram(rollouts, task.config.lift),
         "episodes_each": summarise(rollouts, agent.env.arm, task.cube_qpos),

@@ -1,8 +1,9 @@
-"""Episodes in the stand-in, in as many processes as there are cores."""
+"""Episodes in the stand-in, in one process for each core."""
 
 from __future__ import annotations
 
 import concurrent.futures
+import contextlib
 import dataclasses
 import multiprocessing
 import os
@@ -18,6 +19,7 @@ import numpy as np
 
 from mjx_arm.cores import usable_cores
 from mjx_arm.envs.env import Env
+from mjx_arm.options import Count, CountOrZero, check_value
 from mjx_arm.policy import Policy
 from mjx_arm.standin.levels import Offsets
 from mjx_arm.standin.opengl import opengl_for_children
@@ -29,10 +31,10 @@ _ONE_THREAD = "--xla_cpu_multi_thread_eigen=false"
 
 @dataclasses.dataclass(frozen=True)
 class Start:
-    """Where an episode starts.
+    """Where an episode starts, at rest.
 
     Attributes:
-      qpos: `[nq] float32`.
+      qpos: `[nq] float32`, rad and m.
       ctrl: `[nu] float32`, rad and m.
     """
 
@@ -75,10 +77,10 @@ class Moment:
 
 
 class Film(Protocol):
-    """Makes something of an episode, in the process that has run it; it can be pickled."""
+    """Makes something of an episode, such as a video; it must be picklable."""
 
     def __call__(self, world: StandIn, moments: Sequence[Moment], trace: Trace) -> None:
-        """Is called once, after the episode."""
+        """Is called once, after the episode, in the process that ran it."""
         ...
 
 
@@ -89,8 +91,8 @@ class Job:
     Attributes:
       env: the simulator's environment.
       offsets: of the level.
-      policy: as `mjx_arm.export.export_policy` makes it.
-      iterations: after which an episode ends.
+      policy: as `mjx_arm.export.export_policy` returns it.
+      iterations: an episode without success ends after this number.
       epsilon: share of random actions.
       seed: of the random actions.
       shadows: render shadows.
@@ -106,14 +108,24 @@ class Job:
 
 
 class Runner:
-    """Runs episodes of a job in this process, one after the other."""
+    """Runs episodes of a job in this process, one after the other.
+
+    Raises:
+      ValueError: there is no OpenGL, or the policy or the environment does not fit.
+    """
 
     def __init__(self, job: Job) -> None:
         self.job, self.policy = job, Policy(job.policy)
         self.world = StandIn(job.env, job.offsets, shadows=job.shadows)
 
     def run(self, number: int, start: Start, film: Film | None = None) -> Trace:
-        """Runs one episode; its random actions depend on its number and the job's seed."""
+        """Runs one episode.
+
+        Args:
+          number: of the episode; its random actions depend on it and on the job's seed.
+          start: where it starts.
+          film: is given the episode.
+        """
         rng = np.random.default_rng([self.job.seed, number])
         world = self.world
         moments: list[Moment] = []
@@ -161,26 +173,29 @@ def run_episodes(
 
     Args:
       job: what all episodes have in common.
-      starts: of the episodes.
+      starts: of the episodes, at least one.
       processes: number of processes; by default one for each core. They are spawned, so a script
-        needs `if __name__ == "__main__":`. With 0 all runs in this process, which then must have
-        found MuJoCo's OpenGL when it imported mujoco.
+        needs `if __name__ == "__main__":`. With 0 all episodes run in this process, which then must
+        have found MuJoCo's OpenGL when it imported mujoco.
       film: is given the first episode, in the process that runs it.
-      on_episode: is told of each episode as it ends, in any order.
+      on_episode: is called with each episode as it ends, in any order.
 
     Returns:
       The episodes in the order of their starts.
 
     Raises:
-      ValueError: there is no OpenGL, the policy does not fit, or a process has ended.
+      ValueError: an invalid argument, or there is no OpenGL, the policy does not fit, or a process
+        has ended.
     """
+    check_value("the number of starts", Count, len(starts))
+    check_value("processes", CountOrZero | None, processes)
     told = on_episode or (lambda trace: None)
     if processes == 0:
         runner, traces = Runner(job), []
-        for i, start in enumerate(starts):
-            traces.append(runner.run(i, start, film if i == 0 else None))
-            told(traces[-1])
-        runner.world.close()
+        with contextlib.closing(runner.world):
+            for i, start in enumerate(starts):
+                traces.append(runner.run(i, start, film if i == 0 else None))
+                told(traces[-1])
         return traces
     count = min(len(starts), processes or usable_cores())
     pool = concurrent.futures.ProcessPoolExecutor(
@@ -230,7 +245,7 @@ def _run(number: int, start: Start, film: Any) -> Trace:
 
 
 def end_with(parent: int) -> None:
-    """Ends this process when its parent has ended, however that was."""
+    """Ends this process as soon as the process `parent` has ended; never returns."""
     while os.getppid() == parent:
         time.sleep(0.5)
     os._exit(1)

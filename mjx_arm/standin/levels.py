@@ -15,18 +15,18 @@ _SEED, _TEST_SEED = 1609, 3759
 
 @dataclasses.dataclass(frozen=True)
 class Offsets:
-    """What the stand-in has different from the simulator.
+    """How the stand-in differs from the simulator.
 
     Attributes:
-      camera_shift: how far each camera is moved, m.
-      camera_turn: how far each camera is turned, degrees.
+      camera_shift: distance by which each camera is moved, m.
+      camera_turn: angle by which each camera is turned, degrees.
       colour: the hue is turned by this share of the colour circle, and the brightness is changed
         by this share.
       dynamics: share by which friction and masses are changed.
       servo_gain: share of the servos' gain that is missing.
       image_delay: age of the image that the agent sees, iterations.
       short_step: share of a joint's step that is missing.
-      seed: of the signs.
+      seed: of the directions of all offsets; see `sample_signs`.
     """
 
     camera_shift: float = 0.0
@@ -81,7 +81,7 @@ class Signs:
 
 
 def sample_signs(offsets: Offsets, bodies: int) -> Signs:
-    """The signs of a level, which depend on its seed and on the number of bodies alone."""
+    """The signs of a level, which depend only on its seed and on the number of bodies."""
     rng = np.random.default_rng(offsets.seed)
     signs = 2 * rng.integers(0, 2, 9 + bodies) - 1
     shift, turn, others, masses = np.split(signs, [3, 6, 9])
@@ -120,7 +120,7 @@ def offset_model(model: mujoco.MjModel, offsets: Offsets) -> mujoco.MjModel:
 
 
 def colour_matrix(offsets: Offsets, bodies: int) -> np.ndarray:
-    """What the colours of an image are multiplied by, `[3, 3] float32`.
+    """The matrix that colours (red, green, blue) are multiplied by, `[3, 3] float32`.
 
     The hue is turned about the axis of the greys.
     """

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import collections
+import copy
 import dataclasses
 from collections.abc import Sequence
 
@@ -22,8 +23,8 @@ from mjx_arm.varies import own_params
 
 # A camera's pixel is the mean of this many rendered pixels in each direction.
 _SCALE = 3
-# Of the shadows' texture, a few millimetres a texel. At 4096, the value of the scenes, the shadows
-# take longer than all else.
+# Edge of the shadows' texture, pixels: a few millimetres per texel. At 4096, the value of the
+# scenes, rendering the shadows takes longer than all the rest.
 _SHADOW_SIZE = 512
 
 _WARNINGS = (
@@ -35,7 +36,7 @@ _WARNINGS = (
 
 @dataclasses.dataclass(frozen=True)
 class Measured:
-    """What the task `lift` measures in a state; see `mjx_arm.envs.tasks.lift.Lift`.
+    """What the stand-in measures in a state, as `mjx_arm.envs.tasks.lift.Lift` does.
 
     Attributes:
       distance: between the grasp site and the cube's centre, m.
@@ -56,7 +57,7 @@ class Cameras:
     An OpenGL context belongs to a thread: make and use the cameras in the same one.
 
     Args:
-      model: with the cameras where they are.
+      model: with the cameras where they are; its visual settings stay as they are.
       names: of the cameras.
       size: height and width of an image, pixels.
       colour: `[3, 3]`, what colours are multiplied by.
@@ -80,12 +81,14 @@ class Cameras:
         self._names, self._size, self._scale = tuple(names), size, scale
         self._colour = None if colour is None or np.allclose(colour, np.eye(3)) else colour
         height, width = (scale * edge for edge in size)
+        model = copy.copy(model)
         visual = model.vis
         visual.global_.offheight = max(visual.global_.offheight, height)
         visual.global_.offwidth = max(visual.global_.offwidth, width)
         visual.quality.shadowsize = min(visual.quality.shadowsize, _SHADOW_SIZE)
-        # Scaling down smooths the edges.
-        visual.quality.offsamples = 0 if scale > 1 else visual.quality.offsamples
+        if scale > 1:
+            # Scaling down smooths the edges.
+            visual.quality.offsamples = 0
         try:
             self._renderer = mujoco.Renderer(model, height, width)
         except Exception as error:
@@ -175,8 +178,11 @@ class StandIn:
     def command(self, action: int) -> bool:
         """Moves the target of one servo, as `mjx_arm.envs.arm.apply_action` does.
 
+        Args:
+          action: 0 to `env.num_actions - 1`.
+
         Returns:
-          Whether the command was carried out; else it was blocked.
+          Whether the command was carried out; otherwise it was blocked.
         """
         arm = self.env.arm
         low, high = arm.ctrl_range.T
@@ -266,7 +272,7 @@ class StandIn:
 
 
 def check_env(env: Env) -> None:
-    """Refuses an environment that the stand-in cannot stand in for.
+    """Checks that the stand-in can run an environment.
 
     Raises:
       ValueError: it has another task than `lift`, or its observations are no images.

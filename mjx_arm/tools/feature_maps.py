@@ -9,6 +9,7 @@ moments of the same episode.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import io
 from collections.abc import Callable, Sequence
@@ -19,16 +20,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_arm.export import image_shape
+from mjx_arm.export import image_shape, to_observation
 from mjx_arm.networks import make_network
 from mjx_arm.networks.q_network import PatchConv
+from mjx_arm.options import Count, check_value
 from mjx_arm.physics import compiler_options
 from mjx_arm.render import rgb
-from mjx_arm.render.packing import NO_GEOM, pack
-from mjx_arm.standin.episodes import Start
 from mjx_arm.standin.levels import Offsets
 from mjx_arm.standin.world import StandIn
-from mjx_arm.tools.transfer import ITERATIONS, NEAR_CUBE
+from mjx_arm.tools.transfer import ITERATIONS, NEAR_CUBE, start_keys
 from mjx_arm.training.agent import Agent
 
 _LAYERS = (PatchConv, nn.Conv, nn.Dense, nn.LayerNorm)
@@ -74,7 +74,7 @@ class Comparison:
 
 
 def cosine(one: np.ndarray, other: np.ndarray) -> float:
-    """Cosine of the angle between two arrays of the same size, flattened; 0 where one is zero."""
+    """Cosine of the angle between two arrays of the same size, flattened; 0 if one is all zeros."""
     one, other = one.ravel().astype(np.float64), other.ravel().astype(np.float64)
     size = float(np.linalg.norm(one) * np.linalg.norm(other))
     return float(one @ other) / size if size else 0.0
@@ -103,7 +103,7 @@ def make_layer_outputs(agent: Agent) -> Callable[[np.ndarray], dict[str, np.ndar
         return q, {name: jax.nn.relu(x) for name, x in found.items()}
 
     def outputs(images: np.ndarray) -> dict[str, np.ndarray]:
-        q, found = capture(as_observations(agent, images))
+        q, found = capture(to_observation(agent, jnp.asarray(images)))
         # Dense layers that end in Q-values or in a value are no features.
         ends = (1, agent.env.num_actions)
         names = [x for x in order if found[x].ndim > 2 or found[x].shape[-1] not in ends]
@@ -123,54 +123,48 @@ def _flat(tree: Any, prefix: str = "") -> list[tuple[str, Any]]:
     return found
 
 
-def as_observations(agent: Agent, images: np.ndarray) -> jax.Array:
-    """Images `[N, ..., 3] uint8` as an agent's observations."""
-    x = jnp.asarray(images)
-    if agent.env.config.observation != "packed":
-        return x
-    red, green, blue = (x[..., i].astype(jnp.uint32) for i in range(3))
-    return pack(red, green, blue, jnp.full(red.shape, NO_GEOM, jnp.uint32))
-
-
 def compare_moments(
     agent: Agent,
     offsets: Offsets,
-    starts: Sequence[Start],
     *,
+    seed: int,
+    episodes: int,
     shadows: bool = True,
     others: int = 8,
 ) -> list[Comparison]:
     """Compares the moment at which an agent is to close the gripper, in both worlds.
 
-    The agent acts greedily in the simulator. The moment is the first at which it closes the gripper
-    within 3 cm of the cube, or where it never does, the one nearest to the cube; the stand-in is
+    The agent acts greedily in the simulator. The moment is the first one at which it closes the
+    gripper within 3 cm of the cube; if it never does, the one nearest to the cube. The stand-in is
     put into the same state.
 
     Args:
       agent: that sees pixels by one camera.
       offsets: of the stand-in.
-      starts: of the episodes, one moment each.
+      seed: of the starts, as for `mjx_arm.tools.transfer.sample_starts`.
+      episodes: number of episodes, with one moment each.
       shadows: render the stand-in's shadows.
       others: number of other moments for the yardstick, spread over the episode.
 
     Raises:
       ValueError: the agent sees no image, or several, or there is no OpenGL.
     """
+    check_value("episodes", Count, episodes)
+    check_value("others", Count, others)
     if len(image_shape(agent)) != 3:
         raise ValueError("feature maps are compared for an agent with one camera")
     play, outputs = _make_episode(agent), make_layer_outputs(agent)
-    world = StandIn(agent.env, offsets, shadows=shadows)
     comparisons = []
-    for start in starts:
-        qposes, images, closes = play(start)
-        moment = _moment(world, qposes, closes)
-        world.reset(qposes[moment], start.ctrl)
-        rest = _spread(len(images), moment, others)
-        seen = np.stack([images[moment], world.image, *images[rest]])
-        layers = [_layer(name, x) for name, x in outputs(seen).items()]
-        q = np.asarray(agent.apply(agent.params, as_observations(agent, seen[:2])))
-        comparisons.append(Comparison(moment, seen[0], seen[1], q, layers))
-    world.close()
+    with contextlib.closing(StandIn(agent.env, offsets, shadows=shadows)) as world:
+        for key in start_keys(seed, episodes):
+            qposes, images, closes = play(key)
+            moment = _moment(world, qposes, closes)
+            world.reset(qposes[moment], agent.env.arm.home_ctrl)
+            rest = _spread(len(images), moment, others)
+            seen = np.stack([images[moment], world.image, *images[rest]])
+            layers = [_layer(name, x) for name, x in outputs(seen).items()]
+            q = agent.apply(agent.params, to_observation(agent, jnp.asarray(seen[:2])))
+            comparisons.append(Comparison(moment, seen[0], seen[1], np.asarray(q), layers))
     return comparisons
 
 
@@ -189,11 +183,11 @@ def _spread(length: int, moment: int, count: int) -> np.ndarray:
 
 def _make_episode(
     agent: Agent, iterations: int = ITERATIONS
-) -> Callable[[Start], tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Makes a greedy episode in the simulator from a start.
+) -> Callable[[jax.Array], tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Makes the function that runs a greedy episode in the simulator.
 
-    It returns states `[T, nq]`, images `[T, H, W, 3] uint8`, and whether the agent closes the
-    gripper, `[T] bool`.
+    It takes the key of a start, and returns states `[T, nq]`, images `[T, H, W, 3] uint8`, and
+    whether the agent closes the gripper, `[T] bool`.
     """
     env = agent.env
 
@@ -205,16 +199,13 @@ def _make_episode(
         image = rgb(obs) if env.config.observation == "packed" else obs
         return after, (state.physics.qpos, image, action == env.arm.close_action, ended)
 
-    def run(qpos: jax.Array, ctrl: jax.Array) -> Any:
-        _, state = env.reset(jax.random.key(0))
-        physics = env.physics.init(qpos, ctrl, state.params)
-        state = dataclasses.replace(state, physics=physics, ctrl=ctrl)
-        return jax.lax.scan(step, state, None, length=iterations)[1]
+    def run(key: jax.Array) -> Any:
+        return jax.lax.scan(step, env.reset(key)[1], None, length=iterations)[1]
 
     compiled = jax.jit(run, compiler_options=compiler_options(env.physics))
 
-    def play(start: Start) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        *records, ended = jax.device_get(compiled(start.qpos, start.ctrl))
+    def play(key: jax.Array) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        *records, ended = jax.device_get(compiled(key))
         ends = np.flatnonzero(ended)
         length = int(ends[0]) + 1 if len(ends) else iterations
         qposes, images, closes = (x[:length] for x in records)

@@ -130,7 +130,10 @@ def main() -> None:
     """Writes the textures into the folder that the command line names."""
     parser = argparse.ArgumentParser(description="Writes the textures of the desk scene.")
     parser.add_argument("folder", type=pathlib.Path, help="where the scenes are")
-    for path in write_textures(parser.parse_args().folder):
+    folder = parser.parse_args().folder
+    if not folder.is_dir():
+        parser.error(f"{folder} is not a folder")
+    for path in write_textures(folder):
         sys.stdout.write(f"{path}\n")
 
 

@@ -6,6 +6,7 @@ closed the gripper; with the cube in its grasp from the start it lifted it.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import functools
 import pathlib
@@ -31,17 +32,18 @@ from mjx_arm.training.evaluate import wilson_interval
 from mjx_arm.training.loop import EVALUATION, role_key
 
 ITERATIONS = 400
-# The gripper is at the cube where its grasp site is this near the cube's centre, m.
+# The gripper is at the cube if its grasp site is within this distance of the cube's centre, m.
 NEAR_CUBE = 0.03
-# A cube that is lost at less than this was not lifted, m.
+# A cube that is lost below this height was not lifted, m.
 _LIFTED = 0.01
+# Of each half of a video, pixels.
 _EDGE = 384
 _FONT_SIZE = 15
 
 
 @dataclasses.dataclass(frozen=True)
 class Outcomes:
-    """What a number of episodes came to. Shares are from 0 to 1.
+    """Summary of a number of episodes. Shares are from 0 to 1.
 
     Attributes:
       episodes: number of episodes.
@@ -72,11 +74,11 @@ class Outcomes:
 
 
 def summarise(traces: Sequence[Trace], env: Env) -> Outcomes:
-    """What episodes came to; the same measures for simulator and stand-in.
+    """Summarises episodes, with the same measures for simulator and stand-in.
 
     Args:
       traces: at least one.
-      env: whose actions they are.
+      env: the environment of the actions.
     """
     near = [_open_near(trace, env) for trace in traces]
     closes = [x & (t.action == env.arm.close_action) for x, t in zip(near, traces, strict=True)]
@@ -102,7 +104,10 @@ def summarise(traces: Sequence[Trace], env: Env) -> Outcomes:
 
 
 def _open_near(trace: Trace, env: Env) -> np.ndarray:
-    """Iterations that begin with the open gripper at the cube, `[L] bool`."""
+    """Iterations that begin with the open gripper at the cube, `[L] bool`.
+
+    The gripper is open at the start unless the cube is grasped there; see `LiftConfig.start`.
+    """
     arm, is_open = env.arm, not trace.grasped[0]
     opened = np.zeros(len(trace.action), bool)
     for i, action in enumerate(trace.action):
@@ -116,16 +121,21 @@ def _dropped(trace: Trace) -> bool:
     return bool((lost & (trace.height[:-1] >= _LIFTED)).any())
 
 
+def start_keys(seed: int, episodes: int) -> jax.Array:
+    """Keys `[episodes]` of starts that neither training nor the selection of an agent has seen."""
+    start_key, _ = jax.random.split(role_key(seed, EVALUATION))
+    return jax.random.split(start_key, episodes)
+
+
 def sample_starts(env: Env, seed: int, episodes: int) -> list[Start]:
     """Starts that neither training nor the selection of an agent has seen.
 
     Args:
       env: the environment.
       seed: of the starts.
-      episodes: how many.
+      episodes: number of starts.
     """
-    start_key, _ = jax.random.split(role_key(seed, EVALUATION))
-    qpos, ctrl = jax.device_get(_starter(env)(jax.random.split(start_key, episodes)))
+    qpos, ctrl = jax.device_get(_starter(env)(start_keys(seed, episodes)))
     return [Start(*each) for each in zip(qpos, ctrl, strict=True)]
 
 
@@ -160,7 +170,7 @@ def in_standin(
       offsets: of the level.
       starts: of the episodes.
       epsilon: share of random actions.
-      iterations: after which an episode ends.
+      iterations: an episode without success ends after this number.
       seed: of the random actions.
       shadows: render shadows.
       processes: see `run_episodes`.
@@ -186,9 +196,9 @@ def in_simulation(
     Args:
       agent: with the task `lift`.
       seed: of the starts and of the random actions.
-      episodes: how many; they run side by side.
+      episodes: number of episodes, which run side by side.
       epsilon: share of random actions.
-      iterations: after which an episode ends.
+      iterations: an episode without success ends after this number.
 
     Raises:
       ValueError: an invalid argument.
@@ -266,19 +276,18 @@ class VideoFilm:
     def _frames(
         self, world: StandIn, moments: Sequence[Moment], trace: Trace
     ) -> Iterator[np.ndarray]:
-        camera = Cameras(world.model, world.env.config.cameras[:1], (_EDGE, _EDGE), scale=1)
         rows, columns = (np.arange(_EDGE) * edge // _EDGE for edge in world.env.config.size)
-        data = world.data
-        for step, moment in enumerate(moments):
-            data.qpos[:] = moment.qpos
-            world.update()
-            seen = moment.image if moment.image.ndim == 3 else moment.image[0]
-            frame = np.concatenate([camera.image(data), seen[rows][:, columns]], axis=1)
-            status = f"step {step}   max Q {moment.max_q:.2f}"
-            if step == len(moments) - 1:
-                status += "   success" if trace.success else "   failed"
-            yield _label(frame, world.env.config.size, status)
-        camera.close()
+        names, size = world.env.config.cameras[:1], (_EDGE, _EDGE)
+        with contextlib.closing(Cameras(world.model, names, size, scale=1)) as camera:
+            for step, moment in enumerate(moments):
+                world.data.qpos[:] = moment.qpos
+                world.update()
+                seen = moment.image if moment.image.ndim == 3 else moment.image[0]
+                frame = np.concatenate([camera.image(world.data), seen[rows][:, columns]], axis=1)
+                status = f"step {step}   max Q {moment.max_q:.2f}"
+                if step == len(moments) - 1:
+                    status += "   success" if trace.success else "   failed"
+                yield _label(frame, world.env.config.size, status)
 
 
 def _label(frame: np.ndarray, size: tuple[int, int], status: str) -> np.ndarray:

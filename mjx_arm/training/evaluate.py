@@ -24,8 +24,8 @@ from mjx_arm.physics import compiler_options
 from mjx_arm.shard import WHOLE, Shard
 from mjx_arm.training.mesh import fetch, replicate, shard_of, sharded
 
-# Environments side by side, and iterations in one compiled call.
-_MAX_ENVS = 200
+# Most environments side by side, and iterations in one compiled call.
+MAX_ENVS = 200
 _CHUNK = 100
 
 Apply = Callable[[Any, jax.Array], jax.Array]
@@ -184,7 +184,7 @@ def _specs(shard: Shard) -> _Run:
 
 
 def _start(auto: AutoReset, episodes: int, key: jax.Array, shard: Shard = WHOLE) -> _Run:
-    side_by_side = min(episodes, _MAX_ENVS)
+    side_by_side = min(episodes, MAX_ENVS)
     # Each shard has as many environments; those that are left over run no episode.
     num_envs = -(-side_by_side // shard.count)
     rows = num_envs * shard.count

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from robots import SHAPE, SimulatedClock, Thinker, TwoJoints
 
-from mjx_arm.deploy.guard import Guard
+from mjx_arm.deploy.guard import Guard, make_guard
 from mjx_arm.deploy.log import Log, read_log, replay
 from mjx_arm.deploy.loop import LoopConfig, Outcome, run_loop, stop_on_signals
 from mjx_arm.deploy.robot import Frame
@@ -160,6 +160,12 @@ def test_the_gripper_stays_in_its_box(run, guard) -> None:
     assert guard.refuses(np.asarray([0.0, 25.0]), 1, -1.0) is None
 
 
+@pytest.mark.parametrize("box", [(0, 0, 0, 1, 1), (0, 0, 0, 1, 1, 0), (0, 0, 0, 1, 1, np.nan)])
+def test_a_workspace_is_a_box(guard, box) -> None:
+    with pytest.raises(ValueError, match="the workspace must be x y z of its lower corner"):
+        make_guard(guard.scene, guard.arm, box)
+
+
 def image_of(robot: TwoJoints, image: object) -> None:
     def make(number: int) -> Frame:
         return Frame(image if number > 4 else robot.good_frame(number).image, robot.clock.now(), 1)
@@ -229,7 +235,11 @@ def test_a_robot_that_is_gone_ends_the_loop(run) -> None:
     assert made.outcome.ending == "fault"
     assert made.outcome.reason == "the robot is gone"
     assert len(made.robot.told) == 3
-    assert read_log(made.path).end == "the robot is gone"
+    assert made.outcome.ticks == len(made.outcome.inference_ms) == 3
+    assert len(made.outcome.image_age_ms) == 3
+    log = read_log(made.path)
+    assert log.end == "the robot is gone"
+    assert len(log.ticks) == 3
 
 
 def test_what_is_not_foreseen_still_stops_the_arm(run, tmp_path) -> None:
@@ -266,6 +276,26 @@ def test_ctrl_c_stops_the_arm_within_a_tick(run) -> None:
     assert read_log(made.path).end == "stopped by the user"
 
 
+def test_a_second_ctrl_c_does_not_keep_the_arm_from_being_stopped(run, tmp_path) -> None:
+    robots = []
+
+    def prepare(robot: TwoJoints) -> None:
+        robots.append(robot)
+        stop, calls = robot.stop, iter([KeyboardInterrupt])
+
+        def impatient() -> None:
+            for error in calls:
+                raise error
+            stop()
+
+        robot.stop = impatient
+
+    with pytest.raises(KeyboardInterrupt):
+        run(prepare=prepare)
+    assert robots[0].told[-1] == ("stop",)
+    assert read_log(tmp_path / "log.jsonl").end == "the time of 1 s is up"
+
+
 def test_a_policy_of_another_arm_is_rejected(guard) -> None:
     clock = SimulatedClock()
     policy = Thinker(clock, [0])
@@ -298,6 +328,11 @@ def test_a_damaged_log_is_refused_by_its_line(run, tmp_path) -> None:
         read_log(cut)
     record = json.loads(lines[3])
     record["image"]["zlib"] = record["image"]["zlib"][:-8]
+    cut.write_text("\n".join([*lines[:3], json.dumps(record), *lines[4:]]))
+    with pytest.raises(ValueError, match="damaged at line 4"):
+        read_log(cut)
+    record = json.loads(lines[3])
+    del record["q"]
     cut.write_text("\n".join([*lines[:3], json.dumps(record), *lines[4:]]))
     with pytest.raises(ValueError, match="damaged at line 4"):
         read_log(cut)

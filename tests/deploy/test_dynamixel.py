@@ -1,7 +1,10 @@
 from __future__ import annotations
 
+import contextlib
 import json
+import os
 import sys
+import threading
 from collections.abc import Iterator
 
 import numpy as np
@@ -175,6 +178,15 @@ def test_a_cable_that_is_pulled_is_one_sentence(bus, robot) -> None:
             call()
 
 
+def test_a_port_that_has_failed_is_named_once(bus, robot, monkeypatch) -> None:
+    def fail(*arguments: object) -> None:
+        raise OSError
+
+    monkeypatch.setattr(robot._packets, "txPacket", fail)
+    with pytest.raises(RobotError, match=rf"^the port {bus.port} has failed: \w+$"):
+        robot.stop()
+
+
 def test_a_port_that_is_not_there() -> None:
     with pytest.raises(RobotError, match="the port /dev/none cannot be opened"):
         DynamixelRobot(config("/dev/none"), frame)
@@ -184,10 +196,14 @@ def test_a_port_that_is_not_there() -> None:
     ("values", "sentence"),
     [
         ({"joints": [1, 2]}, "joints, signs and zeros must have one value for each joint"),
+        ({"joints": [], "signs": [], "zeros": []}, "and at least one, got 0, 0 and 0"),
         ({"signs": [1, 1, 1, 1, 1, 2]}, "signs must be 1 or -1"),
         ({"gripper": 8}, "must name each servo once"),
         ({"joint": [1]}, "unknown option 'joint': did you mean 'joints'"),
         ({"gripper_open": "wide"}, "gripper_open must be a whole number"),
+        ({"gripper_closed": 2**32}, "gripper_closed must be a whole number from -1048575 to"),
+        # Its register has 16 bits.
+        ({"gripper_current": 2**16 + 200}, "gripper_current must be a whole number from 1 to 2047"),
         ({"baudrate": 0}, "baudrate must be a whole number of at least 1"),
     ],
 )
@@ -213,11 +229,9 @@ def test_the_file_of_an_arm_is_read(tmp_path) -> None:
 def wait_for_the_end(camera: VideoCamera) -> None:
     with camera._lock:
         assert camera._lock.wait_for(lambda: camera._error, 60)
-    assert camera._error == "the camera has ended"
+    assert camera._error == "it has ended"
 
 
-# imageio-ffmpeg leaves its pipes to the garbage collector.
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 def test_a_camera_gives_what_the_agent_sees(tmp_path) -> None:
     video = tmp_path / "camera.mp4"
     grey = [np.full((96, 128, 3), value, np.uint8) for value in (40, 80, 120)]
@@ -229,8 +243,29 @@ def test_a_camera_gives_what_the_agent_sees(tmp_path) -> None:
     wait_for_the_end(camera)
     camera.close()
     assert camera.frame().image.mean() == pytest.approx(120, abs=6)
-    with pytest.raises(RobotError, match="cannot be read"):
+    with pytest.raises(RobotError, match=r"none\.mp4' cannot be read: .*No such file") as error:
         VideoCamera(str(tmp_path / "none.mp4"), (8, 8))
+    assert "\n" not in str(error.value)
+
+
+def test_a_camera_that_hangs_keeps_no_process(tmp_path) -> None:
+    path, ended = tmp_path / "camera.y4m", threading.Event()
+    os.mkfifo(path)
+
+    def film() -> None:
+        with contextlib.suppress(BrokenPipeError), path.open("wb") as file:
+            file.write(b"YUV4MPEG2 W16 H16 F25:1 C420\n" + (b"FRAME\n" + bytes(384)) * 200)
+            file.flush()
+            ended.wait(60)
+
+    thread = threading.Thread(target=film)
+    thread.start()
+    camera = VideoCamera(str(path), (8, 8))
+    assert camera.frame().image.shape == (8, 8, 3)
+    camera.close()
+    assert camera._process.returncode is not None
+    ended.set()
+    thread.join()
 
 
 def test_an_image_is_cut_to_its_middle_and_averaged() -> None:

@@ -105,11 +105,20 @@ def test_a_second_client_is_refused_and_the_first_one_goes_on(server) -> None:
         pytest.param(bytes(range(256)) * 16, "garbage came over the socket", id="noise"),
         (struct.pack("!4sII", b"MJXA", 4, 0) + b"\xff\xfe{}", "garbage came over the socket"),
         (struct.pack("!4sII", b"MJXA", 2**31, 0), "garbage came over the socket"),
+        pytest.param(
+            struct.pack("!4sII", b"MJXA", 60_000, 0) + b"[" * 60_000,
+            "garbage came over the socket",
+            id="nested",
+        ),
         (struct.pack("!4sII", b"MJXA", 2, 0) + b"{}", "a message without a kind"),
         ({"kind": "fly"}, "a command is of the kind 'fly'"),
         ({"kind": "move", "joint": 2, "degrees": 1.0}, "a command names the joint 2"),
         ({"kind": "move", "joint": 0, "degrees": 90.0}, "moves a joint by 90.0 degrees instead"),
         ({"kind": "move", "joint": 0, "degrees": float("nan")}, "moves a joint by nan degrees"),
+        ({"kind": "move", "joint": 0, "degrees": True}, "moves a joint by True degrees"),
+        pytest.param(
+            {"kind": "move", "joint": 0, "degrees": 10**400}, "moves a joint by 1000", id="huge"
+        ),
         ({"kind": "move", "joint": True, "degrees": 1.0}, "a command names the joint True"),
         ({"kind": "reset", "start": 3}, "a command names the start 3"),
     ],
@@ -224,6 +233,13 @@ def test_nothing_listens() -> None:
 def test_a_port_that_is_taken_is_refused(server) -> None:
     with pytest.raises(ValueError, match=f"port {server.port} of 127.0.0.1 cannot be listened on"):
         Server(HELLO, server.port)
+
+
+def test_after_the_end_nothing_listens() -> None:
+    ended = Server(HELLO)
+    ended.close()
+    with pytest.raises(RobotError, match=f"no stand-in listens on port {ended.port}"):
+        StandInRobot(ended.port)
 
 
 def test_messages_are_framed() -> None:

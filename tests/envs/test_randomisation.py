@@ -332,7 +332,7 @@ def test_mjx_runs_the_whole_of_it() -> None:
             r"camera_shift must be a finite number from 0 to 0.3 or None, got",
         ),
         ({"friction": (1.5, 0.5)}, r"friction must be a least and a greatest value.*swap them"),
-        ({"cube_size": (0.5, 1.0)}, r"cube_size must be two factors from 0.86 to 1.5, got"),
+        ({"cube_size": (0.5, 1.0)}, r"cube_size must be two values from 0.86 to 1.5, got"),
         ({"cube_red": (0.5, 1.5)}, r"cube_red must be two values from 0 to 1, got"),
         ({"image_delay": 1.5}, "image_delay must be a whole number from 0 to 16"),
         ({"colour_jitters": 0.1}, "unknown option 'colour_jitters': did you mean 'colour_jitter'"),
@@ -343,6 +343,12 @@ def test_invalid_options_are_one_sentence(options, message: str) -> None:
     with pytest.raises(ValueError, match=message) as error:
         mjx_arm.train_config(**options)
     assert "\n" not in str(error.value)
+
+
+def test_a_camera_keeps_a_field_of_view(model) -> None:
+    config = RandomisationConfig(view_change=42.0)
+    with pytest.raises(ValueError, match=r"view_change must be below 42 degrees.*, got 42"):
+        make_randomiser(config, model, ["front"])
 
 
 def test_options_are_named_without_a_group_and_survive_a_file() -> None:

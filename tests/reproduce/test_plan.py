@@ -126,7 +126,7 @@ def test_bad_input_gets_one_sentence(arguments, message, tmp_path, monkeypatch, 
 
 
 def test_a_page_without_any_cell_names_every_command(tmp_path, capsys):
-    out = tmp_path / "page"
+    out = tmp_path / "the page"
     assert main(["reproduce", "--shipped", "--only", "page", "--out", str(out)]) == 0
     page = (out / "index.html").read_text()
     for part in (
@@ -135,9 +135,10 @@ def test_a_page_without_any_cell_names_every_command(tmp_path, capsys):
         "mjx-arm transfer AGENT --level near",
     ):
         assert part in page
-    assert f"--shipped --out {out}" in page
     assert "http" not in page.replace("http-equiv", "")
-    assert (out / "index.md").is_file()
+    text = (out / "index.md").read_text()
+    assert f"\nmjx-arm reproduce --shipped --out '{out}'\n" in text
+    assert f"> '{out}/cells/transfer-near.json'" in text
 
 
 def test_options_of_a_cell_that_changed_make_it_missing(tmp_path):

@@ -7,6 +7,7 @@ import json
 import pytest
 from made_runs import make_run
 
+from mjx_arm.reproduce import command
 from mjx_arm.reproduce.curves import read_curve
 from mjx_arm.reproduce.page import page_blocks, write_pages
 from mjx_arm.reproduce.plan import make_plan
@@ -128,6 +129,16 @@ def test_each_change_has_its_difference_and_a_sentence(tmp_path, run):
     assert "Not tried: a distributional head." in text
     assert "`ablation-B-default`, `ablation-B-loss`" in text
     assert "| ablation-A-gamma | fast | 0 | `gamma` 0.98 |" in text
+
+
+def test_the_last_change_in_a_puts_the_changes_in_b_on_the_same_page(tmp_path, run, monkeypatch):
+    result, _ = measure_ablation(run)
+    monkeypatch.setattr(command, "run_training", lambda *arguments: None)
+    monkeypatch.setattr(
+        command, "_measure", lambda plan, cell, console: write(plan, cell.name, result)
+    )
+    page = command.reproduce(tmp_path / "page", shipped=True, only=("ablations",))
+    assert "Not measured yet: `ablation-B-default`" in page.with_name("index.md").read_text()
 
 
 def test_transfer_is_shown_when_its_files_are_there(tmp_path):

@@ -51,6 +51,18 @@ def test_processes_give_what_one_process_gives(agent, job) -> None:
     assert len(told) == 3
 
 
+@pytest.mark.parametrize(
+    ("count", "processes", "sentence"),
+    [
+        (0, 1, "the number of starts must be a whole number of at least 1, got 0"),
+        (1, -1, "processes must be a whole number of at least 0 or None, got -1"),
+    ],
+)
+def test_bad_numbers_are_rejected(count, processes, sentence) -> None:
+    with pytest.raises(ValueError, match=sentence):
+        run_episodes(None, [None] * count, processes=processes)
+
+
 @pytest.mark.slow
 def test_a_process_that_cannot_start_says_why(agent, job) -> None:
     broken = dataclasses.replace(job, policy=b"no policy")

@@ -109,6 +109,13 @@ def test_a_level_changes_image_and_motion(env, reset) -> None:
     moved.close()
 
 
+def test_cameras_leave_the_settings_of_a_model_as_they_are(env) -> None:
+    world = StandIn(env, Offsets())
+    found, own = world.model.vis.quality, env.scene.mj_model.vis.quality
+    assert (found.offsamples, found.shadowsize) == (own.offsamples, own.shadowsize)
+    world.close()
+
+
 def test_hold_keeps_the_joints_where_they_are(env, reset) -> None:
     world = StandIn(env, Offsets())
     at(world, reset(jax.random.key(0))[1])

@@ -7,16 +7,15 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from mjx_arm.export import to_observation
 from mjx_arm.standin.levels import Offsets, find_level
 from mjx_arm.tools.feature_maps import (
-    as_observations,
     compare_moments,
     cosine,
     draw_comparisons,
     make_layer_outputs,
     to_json,
 )
-from mjx_arm.tools.transfer import sample_starts
 from mjx_arm.training.agent import load_agent
 
 
@@ -45,7 +44,7 @@ def test_the_outputs_are_those_of_the_network() -> None:
     x = np.maximum(x + agent.params["params"]["PatchConv_0"]["bias"], 0)
     assert outputs["PatchConv_0"] == pytest.approx(x, abs=1e-4)
     assert list(outputs)[:3] == ["PatchConv_0", "PatchConv_1", "PatchConv_2"]
-    q = np.asarray(agent.apply(agent.params, as_observations(agent, images)))
+    q = np.asarray(agent.apply(agent.params, to_observation(agent, images)))
     advantages = q - q.mean(axis=-1, keepdims=True)
     assert list(outputs)[-1] == "Q-values"
     assert outputs["Q-values"] == pytest.approx(advantages, abs=1e-4)
@@ -55,9 +54,8 @@ def test_the_outputs_are_those_of_the_network() -> None:
 @pytest.mark.usefixtures("opengl")
 def test_a_moment_in_both_worlds() -> None:
     agent = load_agent("agent-a")
-    starts = sample_starts(agent.env, 3, 1)
-    (same,) = compare_moments(agent, Offsets(), starts, shadows=False)
-    (other,) = compare_moments(agent, find_level("test"), starts)
+    (same,) = compare_moments(agent, Offsets(), seed=3, episodes=1, shadows=False)
+    (other,) = compare_moments(agent, find_level("test"), seed=3, episodes=1)
     assert same.moment == other.moment
     assert np.abs(same.simulated.astype(int) - same.real).mean() < 3
     for one, two in zip(same.layers, other.layers, strict=True):

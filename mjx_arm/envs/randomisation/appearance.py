@@ -32,7 +32,8 @@ def appearance_parts(
     """The parts that change the image alone.
 
     Raises:
-      ValueError: a range is given for what the scene does not have.
+      ValueError: `ambient_light` varies, and the scene's headlight is not active; or `view_change`
+        is too large for the field of view of a camera.
     """
     ids = [int(mj_model.camera(name).id) for name in cameras]
     found = [
@@ -47,7 +48,10 @@ def appearance_parts(
         _camera_shift(mj_model, ranges, ids),
         _camera_turn(mj_model, ranges, ids),
         _field_of_view(mj_model, ranges, ids),
-        *_sensor(ranges),
+        _blur(ranges),
+        _gain(ranges),
+        _noise(ranges),
+        _image_delay(ranges),
     ]
     return [part for part in found if part is not None]
 
@@ -64,8 +68,7 @@ def _colours(model: mujoco.MjModel, ranges: Ranges) -> Part | None:
 
     def make(uniform: jax.Array, growth: Growth) -> Params:
         uniform = uniform.reshape(-1, 4)
-        low, high = own[:, :3] - jitter, own[:, :3] + jitter
-        colour = own[:, :3] + growth * (low + uniform[:, :3] * (high - low) - own[:, :3])
+        colour = own[:, :3] + growth * jitter * (2 * uniform[:, :3] - 1)
         if red is not None:
             share = between(uniform[:, 3], *red, own[:, 0], growth)
             colour = colour.at[:, 0].set(jnp.where(reddens, share, colour[:, 0]))
@@ -242,6 +245,12 @@ def _field_of_view(model: mujoco.MjModel, ranges: Ranges, ids: list[int]) -> Par
     if ranges.view_change == 0:
         return None
     own = rows(model, "cam_fovy")[ids]
+    most = min(own.min(), 180 - own.max())
+    if ranges.view_change >= most:
+        raise ValueError(
+            f"view_change must be below {most:g} degrees, so that the field of view of each camera "
+            f"stays between 0 and 180 degrees, got {ranges.view_change:g}"
+        )
 
     def make(uniform: jax.Array, growth: Growth) -> Params:
         return {"cam_fovy": jnp.asarray(own) + growth * ranges.view_change * (2 * uniform - 1)}
@@ -249,41 +258,45 @@ def _field_of_view(model: mujoco.MjModel, ranges: Ranges, ids: list[int]) -> Par
     return Part({"cam_fovy": tuple(ids)}, len(ids), make)
 
 
-def _sensor(ranges: Ranges) -> list[Part]:
-    parts = []
-    if not is_fixed(ranges.image_blur, 0.0):
-        parts.append(
-            Part({"image_blur": (0,)}, 1, lambda u, g: {"image_blur": _ranged(u, ranges, g)})
-        )
-    if not is_fixed(ranges.exposure, 1.0) or ranges.white_balance > 0:
-        parts.append(
-            Part({"image_gain": (0,)}, 4, lambda u, g: {"image_gain": _gain(u, ranges, g)})
-        )
-    if not is_fixed(ranges.image_noise, 0.0):
-        names = ("image_noise", "image_seed")
-        parts.append(Part(dict.fromkeys(names, (0,)), 2, lambda u, g: _noise(u, ranges, g)))
-    if ranges.image_delay:
-        parts.append(
-            Part(
-                {"image_delay": (0,)},
-                1,
-                lambda u, g: {"image_delay": delay_of(u, ranges.image_delay, g)},
-            )
-        )
-    return parts
+def _blur(ranges: Ranges) -> Part | None:
+    if is_fixed(ranges.image_blur, 0.0):
+        return None
+
+    def make(uniform: jax.Array, growth: Growth) -> Params:
+        return {"image_blur": between(uniform, *ranges.image_blur, 0.0, growth)}
+
+    return Part({"image_blur": (0,)}, 1, make)
 
 
-def _ranged(uniform: jax.Array, ranges: Ranges, growth: Growth) -> jax.Array:
-    return between(uniform, *ranges.image_blur, 0.0, growth)
+def _gain(ranges: Ranges) -> Part | None:
+    """The exposure, times a factor for each channel."""
+    if is_fixed(ranges.exposure, 1.0) and ranges.white_balance == 0:
+        return None
+
+    def make(uniform: jax.Array, growth: Growth) -> Params:
+        exposure = between(uniform[0], *ranges.exposure, 1.0, growth)
+        balance = 1 + growth * ranges.white_balance * (2 * uniform[1:] - 1)
+        return {"image_gain": (exposure * balance)[None]}
+
+    return Part({"image_gain": (0,)}, 4, make)
 
 
-def _gain(uniform: jax.Array, ranges: Ranges, growth: Growth) -> jax.Array:
-    """`[1, 3] float32`: the exposure, times a factor for each channel."""
-    exposure = between(uniform[0], *ranges.exposure, 1.0, growth)
-    balance = 1 + growth * ranges.white_balance * (2 * uniform[1:] - 1)
-    return (exposure * balance)[None]
+def _noise(ranges: Ranges) -> Part | None:
+    if is_fixed(ranges.image_noise, 0.0):
+        return None
+
+    def make(uniform: jax.Array, growth: Growth) -> Params:
+        deviation = between(uniform[:1], *ranges.image_noise, 0.0, growth)
+        return {"image_noise": deviation, "image_seed": uniform[1:]}
+
+    return Part({"image_noise": (0,), "image_seed": (0,)}, 2, make)
 
 
-def _noise(uniform: jax.Array, ranges: Ranges, growth: Growth) -> Params:
-    deviation = between(uniform[:1], *ranges.image_noise, 0.0, growth)
-    return {"image_noise": deviation, "image_seed": uniform[1:]}
+def _image_delay(ranges: Ranges) -> Part | None:
+    if not ranges.image_delay:
+        return None
+
+    def make(uniform: jax.Array, growth: Growth) -> Params:
+        return {"image_delay": delay_of(uniform, ranges.image_delay, growth)}
+
+    return Part({"image_delay": (0,)}, 1, make)

@@ -29,39 +29,39 @@ class RandomisationConfig:
     """Options of domain randomisation: what differs from episode to episode.
 
     An option that is None has the value of the preset `randomisation`. Values are uniform in their
-    ranges, and sampled when an episode starts. `off` varies nothing. The presets follow ranges that
-    others have published, where they have: `tight` those of Squint (arXiv 2602.21203), `standard`
-    those of MuJoCo Playground's `randomize_vision.py`.
+    ranges, and sampled when an episode starts. `off` varies nothing. Where others have published
+    ranges, the presets follow them: `tight` those of Squint (arXiv 2602.21203), `standard` those of
+    MuJoCo Playground's `randomize_vision.py`.
 
     Attributes:
       randomisation: `off`, `tight` or `standard`.
       growth_steps: iterations of each environment over which all ranges grow from nothing to their
         full width; 0 for full ranges from the start. Evaluations have full ranges.
-      colour_jitter: most that each channel of a geom's colour changes, in 0..1.
-      cube_red: red channel of objects that move freely.
+      colour_jitter: largest change of each channel of a geom's colour, in 0..1.
+      cube_red: red channel of objects that move freely, in 0..1.
       texture_swap: share of the episodes in which a textured material has a random one of the
         scene's textures of the same kind.
       texture_scale: factor on how often textures repeat.
       background: brightness of each channel of pixels that hit nothing, in 0..1.
-      light_angle: most that each light's direction turns, degrees.
+      light_angle: largest turn of each light's direction, degrees.
       light_strength: factor on each light's brightness.
       ambient_light: brightness of the light that reaches everything, in 0..1.
       shadow_share: share of the episodes in which lights cast shadows, where `shadows` is set.
-      camera_shift: most that each coordinate of a camera moves, m.
-      camera_turn: most that a camera turns, about any axis, degrees.
-      view_change: most that the vertical field of view changes, degrees.
+      camera_shift: largest shift of a camera along each axis, m.
+      camera_turn: largest turn of a camera, about any axis, degrees.
+      view_change: largest change of the vertical field of view, degrees.
       image_noise: standard deviation of the noise of each pixel, levels of 255.
       image_blur: share of a blurred image (1-2-1 along both axes) in the image, 0 to 1.
       exposure: factor on the image's brightness.
-      white_balance: most that a further factor on each channel differs from 1.
-      image_delay: most iterations by which the image lags behind.
+      white_balance: largest difference from 1 of a further factor on each channel.
+      image_delay: largest number of iterations by which the image lags behind.
       link_mass: factor on the mass of each link.
       friction: factor on the friction of objects, one at the gripper and one at the table.
       servo_gain: factor on the stiffness of each servo.
-      servo_damping: factor on its damping.
-      action_delay: most iterations by which actions are carried out late.
+      servo_damping: factor on the damping of each servo.
+      action_delay: largest number of iterations by which actions are carried out late.
       cube_size: factor on the edges of objects that move freely.
-      cube_mass: factor on their mass.
+      cube_mass: factor on the mass of objects that move freely.
     """
 
     randomisation: Preset = "off"
@@ -92,23 +92,17 @@ class RandomisationConfig:
     cube_mass: Factor | None = None
 
     def check(self) -> None:
-        """Refuses ranges that are upside down, and values that nothing has."""
+        """Checks that ranges have their least value first, and stay within their limits."""
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
             if isinstance(value, tuple) and value[0] > value[1]:
                 raise ValueError(
                     f"{field.name} must be a least and a greatest value, got {value}: swap them"
                 )
-        for name in ("cube_red", "background", "image_blur", "ambient_light"):
-            value = getattr(self, name)
-            if value is not None and value[1] > 1:
-                raise ValueError(f"{name} must be two values from 0 to 1, got {value}")
         for name, (low, high) in _LIMITS.items():
             value = getattr(self, name)
             if value is not None and not low <= value[0] <= value[1] <= high:
-                raise ValueError(
-                    f"{name} must be two factors from {low:g} to {high:g}, got {value}"
-                )
+                raise ValueError(f"{name} must be two values from {low:g} to {high:g}, got {value}")
 
     @property
     def ranges(self) -> Ranges:
@@ -122,9 +116,13 @@ class RandomisationConfig:
         return dataclasses.replace(preset, **given)
 
 
-# Beyond these servos oscillate (`2 h kv / m + h h kp / m` must stay below 4, and is 2.4), or the
-# cube does not fit into the gripper, which closes to 84 % of it; see xml/arm_cube.xml.
+# Beyond the factors' limits servos oscillate (`2 h kv / m + h h kp / m` must stay below 4, and is
+# 2.4), or the cube does not fit into the gripper, which closes to 84 % of it; see xml/arm_cube.xml.
 _LIMITS = {
+    "cube_red": (0.0, 1.0),
+    "background": (0.0, 1.0),
+    "image_blur": (0.0, 1.0),
+    "ambient_light": (0.0, 1.0),
     "cube_size": (0.86, 1.5),
     "servo_gain": (0.3, 1.6),
     "servo_damping": (0.5, 1.5),

@@ -24,7 +24,7 @@ _AFFINE = int(mujoco.mjtBias.mjBIAS_AFFINE)
 
 
 def dynamics_parts(mj_model: mujoco.MjModel, ranges: Ranges) -> list[Part]:
-    """The parts that change the physics; the size of objects changes the image as well."""
+    """The parts that change the physics; the size of objects changes the image too."""
     found = [
         _links(mj_model, ranges),
         _objects(mj_model, ranges),

@@ -1,4 +1,4 @@
-"""What domain randomisation is made of: parts, each of which turns random numbers into params."""
+"""Parts of domain randomisation, each of which turns random numbers into params."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ class Part:
     """One thing that varies.
 
     Attributes:
-      varies: the rows that it gives.
-      numbers: how many random numbers it needs.
+      varies: the rows that it gives values to.
+      numbers: number n of random numbers that it needs.
       make: `(numbers [n] float32 uniform in 0..1, growth []) -> Params` of those rows.
     """
 
@@ -39,14 +39,17 @@ def between(
     own: np.ndarray | jax.Array | float,
     growth: Growth,
 ) -> jax.Array:
-    """A value in a range, drawn towards the scene's own value while the range grows.
+    """A value in a range that grows from the scene's own value.
 
     Args:
       uniform: `[...] float32` in 0..1.
-      least: of the range.
-      greatest: of the range.
-      own: what the scene has, of any shape that broadcasts.
+      least: the least value of the range.
+      greatest: its greatest value.
+      own: the scene's own value, of any shape that broadcasts.
       growth: share of the range.
+
+    Returns:
+      `[...] float32`.
     """
     value = least + uniform * (greatest - least)
     if isinstance(growth, float) and growth == 1.0:
@@ -55,7 +58,7 @@ def between(
 
 
 def scaled(own: np.ndarray, factor: jax.Array) -> jax.Array:
-    """What the scene has times a factor."""
+    """The scene's own values times a factor, float32."""
     return jnp.asarray(own) * factor
 
 
@@ -76,10 +79,10 @@ def geoms_of(mj_model: mujoco.MjModel, bodies: list[int]) -> list[int]:
 
 
 def delay_of(uniform: jax.Array, most: int, growth: Growth) -> jax.Array:
-    """A delay, `[] float32`: 0 to `most` whole iterations, each as likely at full growth.
+    """A delay of 0 to `most` whole iterations, float32; all are equally likely at full growth.
 
     Args:
-      uniform: `[] float32`, a random number in 0..1.
+      uniform: `[...] float32`, random numbers in 0..1.
       most: the largest delay, iterations.
       growth: share of the range.
     """

@@ -19,7 +19,7 @@ from mjx_arm.kinematics import find_camera
 from mjx_arm.render.geoms import visible_geoms
 from mjx_arm.varies import Params, Varies, merge_params, merge_varies
 
-# What an image is made from, besides `qpos`.
+# Fields that change an image start with these.
 _IMAGE_PREFIXES = (
     "body_pos",
     "body_quat",
@@ -35,12 +35,13 @@ _NOT_IMAGE = ("geom_friction", "geom_solref", "geom_solimp", "image_delay")
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Randomiser:
-    """What varies by episode, beside what the task varies.
+    """Samples what varies by episode, besides what the task varies.
 
     Attributes:
-      parts: what it is made of; none where nothing varies.
+      parts: what varies; empty if nothing does.
       ranges: the ranges.
-      growth_steps: iterations of an environment until ranges have their full width; 0 for always.
+      growth_steps: iterations of an environment until the ranges have their full width; 0 for full
+        ranges from the start.
     """
 
     parts: tuple[Part, ...]
@@ -53,7 +54,7 @@ class Randomiser:
 
     @functools.cached_property
     def varies(self) -> Varies:
-        """The rows that it gives."""
+        """The rows of the model that vary."""
         empty: Varies = {}
         return functools.reduce(merge_varies, (part.varies for part in self.parts), empty)
 
@@ -68,6 +69,9 @@ class Randomiser:
         Args:
           key: a PRNG key.
           growth: share of the ranges, 0 to 1.
+
+        Returns:
+          The values of the rows `varies`.
         """
         # One call: each has a cost of its own, in every environment at every step.
         numbers = jax.random.uniform(key, (sum(part.numbers for part in self.parts),), jnp.float32)
@@ -97,7 +101,7 @@ def make_randomiser(
       cameras: names of the cameras whose pose and field of view vary.
 
     Raises:
-      ValueError: a range is given for what the scene does not have, or a camera is unknown.
+      ValueError: a camera is unknown, or see `appearance_parts`.
     """
     ranges = config.ranges
     if ranges == Ranges():
@@ -109,7 +113,7 @@ def make_randomiser(
 
 
 def image_varies(mj_model: mujoco.MjModel, varies: Varies) -> Varies:
-    """The part of what varies that an image shows: the replay stores no more than that."""
+    """The rows that change an image: those whose params the replay stores."""
     visible = visible_geoms(mj_model, varies)
     found = {}
     for field, ids in varies.items():
@@ -121,7 +125,7 @@ def image_varies(mj_model: mujoco.MjModel, varies: Varies) -> Varies:
 
 
 def select_rows(varies: Varies, params: Params, wanted: Varies) -> Params:
-    """The params of `wanted`, which names some of the rows of `varies`."""
+    """The params of the rows `wanted`, which are some of the rows `varies`."""
     selected = {}
     for field, ids in wanted.items():
         have = varies[field]
