@@ -266,8 +266,7 @@ def transfer(plan: Plan) -> Iterator[Block]:
     if missing:
         folder = plan.store.folder / CELLS
         yield Missing(
-            f"Success in the stand-in for reality at {', '.join(missing)}. The command comes with "
-            "the desk scene.",
+            f"Success in the stand-in for reality at {', '.join(missing)}. Not measured yet.",
             "\n".join(
                 f"mjx-arm transfer AGENT --level {level} --episodes 200 --json "
                 f"> {folder}/transfer-{level}.json"
@@ -275,6 +274,6 @@ def transfer(plan: Plan) -> Iterator[Block]:
             ),
         )
     yield Text(
-        "Figure 5, the feature maps of each layer in simulation and in the stand-in, comes with "
-        "the same command and is missing."
+        "Figure 5, the feature maps of each layer in simulation and in the stand-in, is not on "
+        "this page. `python benchmarks/feature_maps.py AGENT --out FOLDER` makes it."
     )
