@@ -21,8 +21,8 @@ STAMP := $(VENV)/.locked-$(LOCK)
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 SUPPORTED := import sys; sys.exit(sys.version_info[:2] not in {(3, 11), (3, 12), (3, 13)})
 
-.PHONY: help setup train play test test-slow test-long test-campaign peers test-peers onnx test-onnx docs format \
-  lock lock-peers lock-onnx lock-docs clean
+.PHONY: help setup train play test test-slow test-long test-campaign peers test-peers onnx test-onnx docs \
+  test-docs format lock lock-peers lock-onnx lock-docs clean
 
 help:
 	@echo "make setup      build $(VENV) from the lock; GPU=cuda12 or GPU=cuda13 for NVIDIA"
@@ -37,6 +37,7 @@ help:
 	@echo "make onnx       build $(ONNX), whose mjx-arm export has --format onnx"
 	@echo "make test-onnx  the test of ONNX, there"
 	@echo "make docs       build the documentation, with its notebooks, and check its links"
+	@echo "make test-docs  open the built pages in Chromium, as wide as a desktop and as a phone"
 	@echo "make format     let ruff rewrite the sources"
 	@echo "make lock       resolve the lock again; ARGS=--upgrade for the newest versions"
 	@echo "make clean      remove caches and built packages (not $(VENV), not runs/)"
@@ -126,6 +127,10 @@ docs: $(DOCS)/.locked
 	  --doctree-dir docs/_build/doctrees docs $(SITE)
 	$(DOCS)/bin/python docs/check_site.py $(SITE)
 	@echo "open $(SITE)/index.html"
+
+# In the environment of the tests, which has playwright.
+test-docs: $(STAMP)
+	$(BIN)/python docs/check_browser.py $(SITE)
 
 $(DOCS)/.locked: requirements/docs.txt
 	@$(PYTHON) -m venv --clear $(DOCS)

@@ -139,6 +139,51 @@ def _time_to_success(content: Any) -> Table:
     return ["learner", goal, "minutes", "steps", "success then", "machine"], rows
 
 
+def _before_after(content: Any) -> Table:
+    rows = [
+        [
+            row["stage"],
+            _number(row["before"]),
+            _number(row["after"]),
+            f"{row['ratio']:.2f} ({row['low']:.2f} to {row['high']:.2f})",
+        ]
+        for row in content["rows"]
+    ]
+    before, after = (content["commits"][x] for x in ("before", "after"))
+    return [
+        "stage, backend, environments",
+        f"before, per s (commit `{before}`)",
+        f"after, per s (commit `{after}`)",
+        "ratio (interval)",
+    ], rows
+
+
+def _tasks(content: Any) -> Table:
+    rows = []
+    for row in content["rows"]:
+        judged, about, config = row["evaluation"], row["machine"], row["config"]
+        low, high = (100 * x for x in judged["ci95"])
+        rows.append(
+            [
+                row["task"],
+                f"{row['minutes']:.1f}",
+                f"{100 * judged['rate']:.1f} % ({low:.1f} to {high:.1f})",
+                f"{about['cpu']}, {about['cores']} cores, {_versions(about)}",
+                f"`{task_command(config)}`",
+            ]
+        )
+    return ["task", "minutes", "success (95 % interval)", "machine", "training"], rows
+
+
+def task_command(config: Any) -> str:
+    """The command that trains with a configuration of `benchmarks/tasks.py`."""
+    env = config["env"]
+    return (
+        f"mjx-arm train --preset state --task {env['task']} --env {env['env']} "
+        f"--total-steps {config['total_steps']}"
+    )
+
+
 def _desk(content: Any) -> Table:
     rows = []
     for row in content["rows"]:
@@ -166,8 +211,13 @@ def _machine(content: Any) -> str:
     machine = content.get("machine")
     if machine is None:
         return ""
-    versions = ", ".join(f"{x} {machine[x]}" for x in ("jax", "mujoco", "torch") if x in machine)
-    return f"Machine: {machine['cpu']}, {machine['cores']} cores, {versions}."
+    return f"Machine: {machine['cpu']}, {machine['cores']} cores, {_versions(machine)}."
+
+
+def _versions(machine: Any) -> str:
+    """Versions of the packages that a file names; older files do not name mjx_arm's."""
+    names = ("mjx_arm", "jax", "mujoco", "torch")
+    return ", ".join(f"{name} {machine[name]}" for name in names if name in machine)
 
 
 TABLES: dict[str, tuple[str, Callable[[Any], Table]]] = {
@@ -178,6 +228,8 @@ TABLES: dict[str, tuple[str, Callable[[Any], Table]]] = {
     "peer-ratios": ("peers.json", _peer_ratios),
     "profile": ("profile.json", _profile),
     "overhead": ("native_overhead.json", _overhead),
+    "tasks": ("tasks.json", _tasks),
+    "before-after": ("before_after.json", _before_after),
     "desk": ("desk.json", _desk),
     "cold-start": ("cold_start.json", _seconds),
     "smoke": ("smoke.json", _seconds),

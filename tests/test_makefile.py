@@ -1,6 +1,7 @@
 """What the Makefile refuses, and when it builds the environment again."""
 
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -78,6 +79,10 @@ def test_documentation_has_a_lock_of_its_own_and_is_checked(venv: Path) -> None:
     output = make("--dry-run", "docs", f"DOCS={venv}").stdout
     assert BUILDS not in output
     assert output.index("--fail-on-warning") < output.index("docs/check_site.py")
+    (venv / ".locked-cpu").touch()
+    site = re.search(r"check_site\.py (\S+)", output)[1]
+    lines = make("--dry-run", "test-docs", f"VENV={venv}").stdout.splitlines()
+    assert lines[-1] == f"{venv}/bin/python docs/check_browser.py {site}"
 
 
 def test_gpu_environment_is_kept_by_all_but_setup(venv: Path) -> None:

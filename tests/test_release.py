@@ -13,6 +13,8 @@ import zipfile
 from pathlib import Path
 
 import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
 
 import mjx_arm
 
@@ -23,8 +25,6 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 TWINE = "twine==7.0.0"  # earlier ones do not know the metadata that hatchling writes
 # Not installed here: jax for another device, a backend for NVIDIA, and gigabytes of other trainers.
 METADATA_ONLY = {"cuda12", "cuda13", "peers", "warp"}
-# Environments of the repository itself; users do not install them.
-FOR_DEVELOPERS = {"dev", "docs"}
 USE = """
 import importlib, sys
 import jax, mjx_arm
@@ -73,6 +73,12 @@ def without_hashes(lock: str) -> str:
     return "\n".join(pin for pin in pins if not pin.lstrip().startswith("#"))
 
 
+def without_marker(requirement: Requirement) -> str:
+    """A requirement in one spelling, without the extra that asks for it."""
+    extras = ",".join(sorted(requirement.extras))
+    return f"{canonicalize_name(requirement.name)}[{extras}]{requirement.specifier}"
+
+
 def test_version_is_the_same_everywhere(archives: tuple[Path, Path]) -> None:
     sdist, wheel = archives
     version = mjx_arm.__version__
@@ -93,10 +99,18 @@ def test_every_extra_is_in_the_metadata(archives: tuple[Path, Path]) -> None:
         metadata = email.message_from_bytes(archive.read(name))
     extras = PROJECT["optional-dependencies"]
     assert set(metadata.get_all("Provides-Extra")) == set(extras)
-    required = metadata.get_all("Requires-Dist")
-    for extra in METADATA_ONLY:
-        found = [each for each in required if re.search(rf"extra == ['\"]{extra}['\"]", each)]
-        assert len(found) == len(extras[extra])
+    required = [Requirement(each) for each in metadata.get_all("Requires-Dist")]
+    for extra, wanted in extras.items():
+        found = [
+            each
+            for each in required
+            if each.marker is not None
+            and each.marker.evaluate({"extra": extra})
+            and not each.marker.evaluate({"extra": ""})
+        ]
+        assert sorted(map(without_marker, found)) == sorted(
+            without_marker(Requirement(each)) for each in wanted
+        )
 
 
 def test_source_distribution_has_the_documentation(archives: tuple[Path, Path]) -> None:
@@ -115,22 +129,27 @@ def test_twine_accepts_both(archives: tuple[Path, Path], tmp_path: Path) -> None
 
 # gymnax needs an older gymnasium than the lock has, which the lock of the peers has.
 GYMNAX = {"gymnax"}
-OTHERS = set(PROJECT["optional-dependencies"]) - METADATA_ONLY - FOR_DEVELOPERS - GYMNAX
+OTHERS = set(PROJECT["optional-dependencies"]) - METADATA_ONLY - GYMNAX
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("kind", "extras", "lock"), [("sdist", GYMNAX, "peers"), ("wheel", OTHERS, "cpu")]
+    ("kind", "extras", "locks"),
+    [("sdist", GYMNAX, ["peers"]), ("wheel", OTHERS, ["cpu", "docs"])],
+    ids=["sdist", "wheel"],
 )
 def test_installs_from_nothing(
-    kind: str, extras: set[str], lock: str, archives: tuple[Path, Path], tmp_path: Path
+    kind: str, extras: set[str], locks: list[str], archives: tuple[Path, Path], tmp_path: Path
 ) -> None:
-    """Both archives, and each extra that users can install here."""
+    """Both archives, and each extra that can be installed here."""
     python = make_environment(tmp_path / "empty")
-    versions = []
-    if lock == "cpu" or sys.version_info[:2] == (3, 11):  # what the lock of the peers is for
-        (tmp_path / "constraints.txt").write_text(without_hashes(lock))
-        versions = ["--constraint", tmp_path / "constraints.txt"]
+    versions: list[object] = []
+    for lock in locks:
+        # The locks of the peers and of the documentation are for Python 3.11.
+        if lock == "cpu" or sys.version_info[:2] == (3, 11):
+            path = tmp_path / f"{lock}.txt"
+            path.write_text(without_hashes(lock))
+            versions += ["--constraint", path]
     archive = archives[("sdist", "wheel").index(kind)]
     run([*pip(python), *versions, f"{archive}[{','.join(sorted(extras))}]"])
     where = run([python, "-W", "error", "-c", USE, mjx_arm.__version__], cwd=tmp_path)

@@ -88,7 +88,10 @@ class Agents:
             print(json.dumps([agent.to_json() for agent in agents]))
             return
         print(describe_zoo(agents))
-        print("\nmjx-arm agents NAME shows its card; mjx-arm play NAME records a video.")
+        print(
+            "\nSuccess: share of held-out episodes with one random action in ten."
+            "\nmjx-arm agents NAME shows its card; mjx-arm play NAME records a video."
+        )
 
 
 @dataclasses.dataclass(frozen=True)

@@ -6,6 +6,7 @@ import importlib.metadata
 import os
 import pathlib
 import platform
+import sys
 from typing import Any
 
 import jax
@@ -26,6 +27,8 @@ def machine() -> dict[str, Any]:
         "cores": usable_cores(),
         "device": jax.devices()[0].device_kind,
         "python": platform.python_version(),
+        # The package is imported by now. Importing it here would be a cycle.
+        "mjx_arm": sys.modules["mjx_arm"].__version__,
         "jax": jax.__version__,
         "mujoco": mujoco.__version__,
         "xla_flags": os.environ.get("XLA_FLAGS", ""),

@@ -219,10 +219,10 @@ def table1(plan: Plan) -> Iterator[Block]:
     )
     yield Source(tuple(files))
     yield from missing_cells(plan, _names(plan, "episodes"), "Table 1")
-    for way in ("teacher", "pixels"):
+    for way in ("taught", "pixels"):
         here = {subject.trained_in for subject in plan.subjects if subject.way == way}
         if here != {"A", "B"}:
-            section = "agents" if way == "teacher" else "pixels"
+            section = "agents" if way == "taught" else "pixels"
             which = " and ".join(env for env in ("A", "B") if env not in here)
             yield Missing(
                 f"Table 1, '{WAYS[way]}': no agent trained in {which}. This command trains and "

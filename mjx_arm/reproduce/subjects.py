@@ -13,10 +13,10 @@ from mjx_arm.training.run_folder import CONFIG, load_config, seed_configs, seed_
 
 # How an agent was trained -> in words. Rows of a table never mix them.
 WAYS = {
-    "teacher": "sees pixels alone, trained by a privileged teacher",
+    "taught": "sees pixels alone, trained by a privileged teacher",
     "pixels": "sees pixels alone, no network ever saw the state",
     "state": "sees the simulator's state, no pixels",
-    "teacher-paper": "sees pixels alone, privileged teacher, published reward",
+    "taught-paper": "sees pixels alone, privileged teacher, published reward",
     "pixels-paper": "sees pixels alone, no network ever saw the state, published reward",
     "state-paper": "sees the simulator's state, published reward",
 }
@@ -51,7 +51,7 @@ class Subject:
 
     @property
     def name(self) -> str:
-        """Its name in files: `teacher-B-seed0`."""
+        """Its name in files: `taught-B-seed0`."""
         return f"{self.way}-{self.trained_in}-seed{self.seed}"
 
 
@@ -60,7 +60,7 @@ def way_of(config: TrainConfig) -> str | None:
     if config.env.task != "lift" or config.env.reward not in ("completion", "paper"):
         return None
     sees = "state" if config.env.observation == "state" else "pixels"
-    base = "teacher" if config.algorithm == "distill" else sees
+    base = "taught" if config.algorithm == "distill" else sees
     return f"{base}-paper" if config.env.reward == "paper" else base
 
 

@@ -5,12 +5,17 @@ from __future__ import annotations
 import dataclasses
 import json
 import pathlib
+import re
 from collections.abc import Sequence
 from typing import Any
 
 from mjx_arm.config import TrainConfig, parse_config
 from mjx_arm.options import check_name
-from mjx_arm.training.agent import find_agent, read_agent, shipped_agents
+from mjx_arm.training.agent import find_agent, read_agent, read_card, shipped_agents
+from mjx_arm.training.evaluate import wilson_interval
+
+# A row of the table in a card: `| success in B | 987 of 1,000 held-out episodes ...`.
+_SUCCESS = re.compile(r"^\| success in (\w+) \| ([\d,]+) of ([\d,]+)\b", re.MULTILINE)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -22,7 +27,8 @@ class ShippedAgent:
       config: options of its training.
       env_steps: environment steps that it was trained for.
       selection_rate: share of successes in the evaluation that selected it, or None.
-      evaluation: result of the evaluation at the end of its run, or None.
+      results: successes and episodes in each environment in which its card has them, by the
+        environment's name.
       card: how it was trained, how it does and where it fails, in Markdown.
     """
 
@@ -30,7 +36,7 @@ class ShippedAgent:
     config: TrainConfig
     env_steps: int
     selection_rate: float | None
-    evaluation: dict[str, Any] | None
+    results: dict[str, tuple[int, int]]
     card: str
 
     @property
@@ -44,10 +50,13 @@ class ShippedAgent:
 
     @property
     def success(self) -> str:
-        """Its success rate in words, with what was counted."""
-        if self.evaluation is not None:
-            rate, episodes = self.evaluation["rate"], self.evaluation["episodes"]
-            return f"{100 * rate:.1f} % of {episodes:,} held-out episodes"
+        """Its success rates in words, with what was counted."""
+        if self.results:
+            rates = (
+                f"{100 * successes / episodes:.1f} % of {episodes:,} in {env}"
+                for env, (successes, episodes) in self.results.items()
+            )
+            return ", ".join(rates)
         if self.selection_rate is not None:
             episodes = self.config.select_episodes
             return f"{100 * self.selection_rate:.0f} % of the {episodes} that selected it"
@@ -63,7 +72,15 @@ class ShippedAgent:
             "sees": self.sees,
             "env_steps": self.env_steps,
             "selection_rate": self.selection_rate,
-            "evaluation": self.evaluation,
+            "results": {
+                env: {
+                    "episodes": episodes,
+                    "successes": successes,
+                    "rate": successes / episodes,
+                    "ci95": wilson_interval(successes, episodes),
+                }
+                for env, (successes, episodes) in self.results.items()
+            },
         }
 
 
@@ -76,15 +93,28 @@ def read_shipped(name: str) -> ShippedAgent:
     check_name("agent", name, shipped_agents())
     path = find_agent(pathlib.Path(name))
     metadata = read_agent(path)[0]
-    card = path.with_suffix(".md")
+    card = read_card(path, metadata)
     return ShippedAgent(
         name=name,
         config=parse_config(metadata["config"], str(path)),
         env_steps=json.loads(metadata["env_steps"]),
         selection_rate=json.loads(metadata["selection_rate"]),
-        evaluation=json.loads(metadata["evaluation"]),
-        card=card.read_text(encoding="utf-8") if card.is_file() else metadata["card"],
+        results=card_results(card),
+        card=card,
     )
+
+
+def card_results(card: str) -> dict[str, tuple[int, int]]:
+    """The rows `success in ENV` of a card: successes and episodes by the environment's name."""
+    return {
+        env: (_whole_number(successes), _whole_number(episodes))
+        for env, successes, episodes in _SUCCESS.findall(card)
+    }
+
+
+def _whole_number(text: str) -> int:
+    """A number with commas between its thousands."""
+    return int(text.replace(",", ""))
 
 
 def read_zoo() -> list[ShippedAgent]:

@@ -50,7 +50,7 @@ class Agent:
       env_steps: environment steps that it was trained for.
       selection_rate: share of successes in the evaluation that selected it, or None.
       evaluation: result of the evaluation at the end of its run, or None.
-      card: text about the agent.
+      card: text about the agent, in Markdown; empty if there is none.
     """
 
     config: TrainConfig
@@ -260,7 +260,7 @@ def load_agent(
         json.loads(metadata["env_steps"]),
         json.loads(metadata["selection_rate"]),
         json.loads(metadata["evaluation"]),
-        metadata["card"],
+        read_card(path, metadata),
     )
 
 
@@ -370,6 +370,22 @@ def find_agent(path: pathlib.Path) -> pathlib.Path:
 def shipped_agents() -> list[str]:
     """Names of the agents that come with the package; beside each file is its card."""
     return sorted(path.stem for path in _AGENTS.glob("*.safetensors"))
+
+
+def read_card(path: pathlib.Path, metadata: Mapping[str, str]) -> str:
+    """The text about an agent, in Markdown; empty if there is none.
+
+    The card of an agent that comes with the package is the file beside it. It is written after the
+    evaluations, and the agent's file is not changed for it.
+
+    Args:
+      path: of the agent's file.
+      metadata: of the file, from `read_agent`.
+    """
+    beside = path.with_suffix(".md")
+    if path.parent == _AGENTS and beside.is_file():
+        return beside.read_text(encoding="utf-8")
+    return metadata["card"]
 
 
 def read_selection_rate(path: pathlib.Path) -> float | None:

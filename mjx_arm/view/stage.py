@@ -62,6 +62,8 @@ class Stage:
             }
             if self._handle is not None:
                 self._handle.remove()
+            # A handle that is removed while it is dragged is never let go.
+            self._dragging = False
             self._handle = self._make_handle() if handle else None
         centre, extent = np.array(model.stat.center), float(model.stat.extent)
         self._server.initial_camera.position = centre + extent * _EYE

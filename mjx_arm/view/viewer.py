@@ -159,12 +159,15 @@ class Viewer:
         if now >= self._next_look:
             self._next_look = now + _LOOK_EVERY
             self._follow()
-        if not self._paused and now >= self._next_step:
+        if self._paused:
+            self._place_dragged()
+        elif now >= self._next_step:
             self._step(now)
         if now >= self._next_show:
             self._next_show = now + _SHOW_EVERY
             self._show()
-        return max(0.0, min(self._next_step, self._next_show) - time.monotonic())
+        due = self._next_show if self._paused else min(self._next_step, self._next_show)
+        return max(0.0, due - time.monotonic())
 
     def _wish(self, name: str, value: Any) -> None:
         self._wishes.put((name, value))
@@ -180,7 +183,7 @@ class Viewer:
             "choose": self._choose,
             "act": self._one_step,
             "push": lambda push: self.session.push(*push),
-            "drag": lambda position: setattr(self, "_dragged", position),
+            "drag": self._drag,
         }
         wishes[name](value)
         self._next_show = 0.0
@@ -202,11 +205,25 @@ class Viewer:
         if self.session.ended:
             self._restart(None)
             return
-        if self._dragged is not None:
-            self.session.place(self.session.objects[0], self._dragged)
+        self._place_dragged()
         self.session.step()
         if self.session.ended:
             self._next_step = now + _REST
+
+    def _drag(self, position: np.ndarray | None) -> None:
+        """Notes where a visitor holds the object; None when it is let go, and stays there."""
+        if position is None:
+            self._place_dragged()
+        self._dragged = position
+
+    def _place_dragged(self) -> None:
+        """Puts the object where a visitor holds it, if it is not there."""
+        if self._dragged is None:
+            return
+        name = self.session.objects[0]
+        held = np.asarray(self._dragged, np.float32)
+        if (self.session.position(name) != held).any():
+            self.session.place(name, held)
 
     def _show(self) -> None:
         objects = self.session.objects
@@ -287,6 +304,7 @@ class Viewer:
         )
 
     def _build_stage(self) -> None:
+        self._dragged = None
         env = self.session.simulation.env
         model = env.scene.mj_model
         shapes = make_shapes(model, env.varies, self.session.state.params)

@@ -1,6 +1,13 @@
 from __future__ import annotations
 
+import pathlib
+
+import pytest
 from doc_pages import NOTEBOOKS, PAGES, ROOT, commands, notebook_code, snippets, split_environment
+
+from mjx_arm.physics.base import FIELDS
+from mjx_arm.render.look import LOOK_FIELDS
+from mjx_arm.varies import EXTRA_FIELDS
 
 PAGE = """
 Text.
@@ -49,6 +56,10 @@ def test_pages_and_notebooks_are_found():
     assert len(NOTEBOOKS) == 5
 
 
+# Its snippets need several devices.
+_TEXT_ALLOWED = ("scaling.md",)
+
+
 def test_every_language_of_the_pages_is_tested():
     """`text` is no code; `python`, `sh` and `json` are tried by test_snippets.py."""
     for path in PAGES:
@@ -56,6 +67,21 @@ def test_every_language_of_the_pages_is_tested():
             where = f"{path.name}, line {each.line}"
             assert each.language in ("python", "sh", "json", "text"), where
             assert each.mark in ("", "slow", "peers", "check"), where
+
+
+@pytest.mark.parametrize("path", PAGES, ids=lambda path: path.stem)
+def test_what_is_marked_as_text_is_no_python(path: pathlib.Path):
+    """Or no test would run it."""
+    for each in snippets(path.read_text(), path.name):
+        if each.language == "text" and path.name not in _TEXT_ALLOWED:
+            with pytest.raises(SyntaxError):
+                compile(each.text, path.name, "exec")
+
+
+def test_every_field_that_can_vary_is_on_the_page():
+    page = (ROOT / "docs" / "tutorials" / "randomisation.md").read_text()
+    for field in (*FIELDS, *LOOK_FIELDS, *EXTRA_FIELDS):
+        assert f"`{field}`" in page, field
 
 
 def test_every_agent_has_its_card_on_the_page():

@@ -2,10 +2,17 @@ from __future__ import annotations
 
 import json
 import pathlib
+import re
+from typing import Any
 
 import pytest
 from doc_pages import ROOT
-from results import RESULTS, TABLES, render
+from results import RESULTS, TABLES, render, task_command
+
+import mjx_arm
+from mjx_arm.cli.parse import parse
+from mjx_arm.config import dump_config
+from mjx_arm.report.machine import machine
 
 
 @pytest.mark.parametrize("name", TABLES)
@@ -13,16 +20,80 @@ def test_a_table_has_its_file_its_machine_and_equal_rows(name: str):
     text = render(name)
     file = TABLES[name][0]
     assert f"File: `benchmarks/results/{file}`." in text
-    machine = json.loads((RESULTS / file).read_text()).get("machine")
-    assert machine is None or machine["cpu"] in text
+    about = json.loads((RESULTS / file).read_text()).get("machine")
+    assert about is None or about["cpu"] in text
     rows = [line for line in text.splitlines() if line.startswith("|")]
     assert len(rows) > 2
     assert len({row.count("|") for row in rows}) == 1
 
 
+@pytest.mark.parametrize("name", TABLES)
+def test_a_table_says_what_machine_it_is_from(name: str):
+    """Below it, or in a column with a cell for each row."""
+    text = render(name)
+    header, _, *rows = (line for line in text.splitlines() if line.startswith("|"))
+    columns = [cell.strip() for cell in header.strip("|").split("|")]
+    if not re.search(r"^Machine: .+, \d+ cores, ", text, re.MULTILINE):
+        assert {"machine", "device"} & set(columns)
+        column = next(i for i, cell in enumerate(columns) if cell in ("machine", "device"))
+        assert all(row.strip("|").split("|")[column].strip() for row in rows)
+
+
+def test_the_version_is_named_where_a_file_has_it(tmp_path: pathlib.Path):
+    about = {"cpu": "X", "cores": 2, "mjx_arm": "0.2.0", "jax": "1", "mujoco": "2"}
+    content = {"machine": about, "median": {"cold": 1.0}, "all": {"cold": [1.0]}}
+    (tmp_path / "cold_start.json").write_text(json.dumps(content))
+    assert "Machine: X, 2 cores, mjx_arm 0.2.0, jax 1, mujoco 2." in render("cold-start", tmp_path)
+    assert machine()["mjx_arm"] == mjx_arm.__version__
+
+
+def test_ratios_of_versions_have_their_interval(tmp_path: pathlib.Path):
+    about = {"cpu": "X", "cores": 2, "jax": "1", "mujoco": "2"}
+    row = {"stage": "physics", "before": 66177, "after": 51995, "ratio": 0.796}
+    content = {"machine": about, "commits": {"before": "abc", "after": "def"}}
+    content["rows"] = [row | {"low": 0.732, "high": 0.822}]
+    (tmp_path / "before_after.json").write_text(json.dumps(content))
+    text = render("before-after", tmp_path)
+    assert "| before, per s (commit `abc`) | after, per s (commit `def`) |" in text
+    assert "| physics | 66,177 | 51,995 | 0.80 (0.73 to 0.82) |" in text
+
+
+def test_tasks_have_their_figures(tmp_path: pathlib.Path):
+    row = {
+        "task": "reach",
+        "minutes": 3.12,
+        "evaluation": {"rate": 0.977, "ci95": [0.9657, 0.9846]},
+        "machine": {"cpu": "X", "cores": 2, "mjx_arm": "0.2.0", "jax": "1", "mujoco": "2"},
+        "config": {"env": {"task": "reach", "env": "B"}, "total_steps": 500_000},
+    }
+    (tmp_path / "tasks.json").write_text(json.dumps({"rows": [row]}))
+    assert (
+        "| reach | 3.1 | 97.7 % (96.6 to 98.5) | X, 2 cores, mjx_arm 0.2.0, jax 1, mujoco 2 "
+        "| `mjx-arm train --preset state --task reach --env B --total-steps 500000` |"
+    ) in render("tasks", tmp_path)
+
+
+def test_the_command_of_a_task_has_the_options_of_its_training():
+    for row in json.loads((RESULTS / "tasks.json").read_text())["rows"]:
+        config = parse(task_command(row["config"]).split()[1:])[0].options
+        made = _flat(json.loads(json.dumps(dump_config(config))))
+        trained = _flat(row["config"])
+        # The backend that a run takes depends on its device, and is written into its file.
+        made["env.physics"] = trained["env.physics"]
+        assert {name: made[name] for name in trained} == trained
+
+
+def _flat(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    found = {}
+    for name, x in values.items():
+        own = _flat(x, f"{prefix}{name}.") if isinstance(x, dict) else {f"{prefix}{name}": x}
+        found.update(own)
+    return found
+
+
 def test_figures_are_those_of_the_file(tmp_path: pathlib.Path):
-    machine = {"cpu": "X", "cores": 2, "jax": "1", "mujoco": "2"}
-    content = {"machine": machine, "median": {"cold": 16.53}, "all": {"cold": [16.72, 16.53]}}
+    about = {"cpu": "X", "cores": 2, "jax": "1", "mujoco": "2"}
+    content = {"machine": about, "median": {"cold": 16.53}, "all": {"cold": [16.72, 16.53]}}
     (tmp_path / "cold_start.json").write_text(json.dumps(content))
     text = render("cold-start", tmp_path)
     assert "| cold | 16.5 | 16.7, 16.5 |" in text
@@ -30,10 +101,10 @@ def test_figures_are_those_of_the_file(tmp_path: pathlib.Path):
 
 
 def test_what_is_missing_is_not_measured(tmp_path: pathlib.Path):
-    machine = {"cpu": "X", "cores": 2, "jax": "1", "mujoco": "2"}
+    about = {"cpu": "X", "cores": 2, "jax": "1", "mujoco": "2"}
     row = {"num_envs": 16, "stage": "physics", "shadows": False, "steps_per_s": 1234}
     rows = [row, row | {"num_envs": 64, "stage": "render"}]
-    (tmp_path / "throughput.json").write_text(json.dumps({"machine": machine, "rows": rows}))
+    (tmp_path / "throughput.json").write_text(json.dumps({"machine": about, "rows": rows}))
     text = render("throughput", tmp_path)
     assert "| environments | physics, steps/s | rendering, steps/s |" in text
     assert "| 16 | 1,234 | not measured |" in text

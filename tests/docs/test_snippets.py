@@ -1,7 +1,7 @@
 """Every snippet of README and documentation runs, with few steps where it trains.
 
 Commands of the shell are checked by default: their program, their options, the files that they
-name. Those of `mjx-arm` also run, as long tests.
+name. Those of `mjx-arm` also run: a cheap one of each kind as a slow test, the others as long ones.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ import itertools
 import os
 import pathlib
 import re
+import shlex
 import shutil
 import subprocess
 import sys
@@ -50,6 +51,12 @@ _SHORT_TRIES = {"eval": {"episodes": 2, "max-steps": 20}, "play": {"max-steps": 
 # The true levels of the stand-in are read three times an agent, and never by a test.
 _OWN_TESTS = {"compare", "deploy", "sweep", "transfer", "view"}
 _SHELL = all_snippets("sh")
+# The first one of each of these commands on the pages is a slow test, and so is this training.
+_CHEAP = ("agents", "eval", "export", "play")
+_CHEAP_TRAINING = ("train", "--preset", "smoke", "--out", "runs/first")
+# Scripts for Slurm, and what their variables are in the tests.
+_SBATCH = sorted((ROOT / "docs").rglob("*.sbatch"))
+_VARIABLES = {"$run": "runs/first", "$RUN": "runs/first"}
 
 
 def _name(snippet: Snippet) -> str:
@@ -137,6 +144,11 @@ def _check_sbatch(words: list[str]) -> None:
     parse(["train", *(word.replace("$seed", "0") for word in words[1:])])
 
 
+def _check_taskset(words: list[str]) -> None:
+    assert words[0] == "-c"
+    _CHECKS[pathlib.Path(words[2]).name](words[3:])
+
+
 def _check_source(words: list[str]) -> None:
     assert words == [".venv/bin/activate"]
 
@@ -148,6 +160,7 @@ _CHECKS = {
     "python": _check_python,
     "sbatch": _check_sbatch,
     "source": _check_source,
+    "taskset": _check_taskset,
 }
 
 
@@ -163,7 +176,15 @@ def _runs() -> list[object]:
             if words[1:2] and words[1] in _OWN_TESTS:
                 continue
             found.setdefault(tuple(words[1:]), (environment.get("PYTHONPATH", ""), _name(snippet)))
-    return [pytest.param(list(x), path, id=name) for x, (path, name) in found.items()]
+    cheap = {next(x for x in found if x[0] == command) for command in _CHEAP}
+    cheap.add(_CHEAP_TRAINING)
+    assert cheap <= set(found)
+    return [
+        pytest.param(
+            list(x), path, id=name, marks=pytest.mark.slow if x in cheap else pytest.mark.long
+        )
+        for x, (path, name) in found.items()
+    ]
 
 
 def _options(values: dict[str, int]) -> list[str]:
@@ -177,7 +198,6 @@ def _shortened(words: list[str]) -> list[str]:
     return [*words, *_options(_SHORT_TRIES.get(words[0], {}))]
 
 
-@pytest.mark.long
 @pytest.mark.parametrize(("words", "path"), _runs())
 def test_commands_of_the_pages_run(words: list[str], path: str, folder: pathlib.Path):
     sys.path.extend(path.split(":"))
@@ -194,12 +214,30 @@ def test_commands_of_the_pages_run(words: list[str], path: str, folder: pathlib.
     assert main(arguments) == 0
 
 
-@pytest.mark.long
+@pytest.mark.parametrize("script", _SBATCH, ids=lambda path: path.stem)
+def test_job_scripts_name_options_that_there_are(script: pathlib.Path, folder: pathlib.Path):
+    subprocess.run(["bash", "-n", script], check=True)
+    text = script.read_text()
+    asked = [line for line in text.splitlines() if line.startswith("#SBATCH")]
+    assert asked
+    assert all(re.fullmatch(r"#SBATCH --[a-z-]+(=\S+)?", line) for line in asked)
+    lines = re.findall(r"^ *(?:exec|srun) (.*)$", text.replace("\\\n", " "), re.MULTILINE)
+    # One that starts a run, and one that continues it.
+    assert len(lines) == 2
+    for line in lines:
+        words = shlex.split(line.replace('"$@"', ""))
+        assert words[0] == ".venv/bin/mjx-arm"
+        parse([_VARIABLES.get(word, word) for word in words[1:]])
+
+
+@pytest.mark.slow
 def test_the_job_script_starts_a_run_and_continues_it(tmp_path: pathlib.Path):
     """The script of the page about Slurm, by bash."""
     script = ROOT / "docs" / "how-to" / "train.sbatch"
-    path = f"{pathlib.Path(sys.executable).parent}:{os.environ['PATH']}"
-    environment = os.environ | {"RUN": "runs/first", "PATH": path}
+    program = tmp_path / ".venv" / "bin" / "mjx-arm"
+    program.parent.mkdir(parents=True)
+    program.symlink_to(pathlib.Path(sys.executable).with_name("mjx-arm"))
+    environment = os.environ | {"RUN": "runs/first"}
     options = _options(_SHORT | _SHORT_BATCH["dqn"])
     command = ["bash", str(script), "--preset", "state", *options]
     for expected in ("training:", "resuming after"):

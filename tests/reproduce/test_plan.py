@@ -130,8 +130,8 @@ def test_a_page_without_any_cell_names_every_command(tmp_path, capsys):
     assert main(["reproduce", "--shipped", "--only", "page", "--out", str(out)]) == 0
     page = (out / "index.html").read_text()
     for part in (
-        *("figure1-arm_cube", "figure2-teacher-A-seed0", "episodes-teacher-B-seed0-in-A"),
-        *("figure4-teacher-B-seed0", "reward-published-seed0", "paper-A", "ablation-A-gamma"),
+        *("figure1-arm_cube", "figure2-taught-A-seed0", "episodes-taught-B-seed0-in-A"),
+        *("figure4-taught-B-seed0", "reward-published-seed0", "paper-A", "ablation-A-gamma"),
         "mjx-arm transfer AGENT --level near",
     ):
         assert part in page

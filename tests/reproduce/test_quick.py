@@ -38,7 +38,7 @@ def test_an_agent_is_measured_and_the_page_is_the_same_again(tmp_path, capsys):
     assert main(["reproduce", *arguments, "--only", *ONLY]) == 0
     assert "measuring" not in capsys.readouterr().out
     assert cells(out) == before
-    found = json.loads((out / "cells" / "episodes-teacher-B-seed0-in-B.json").read_text())
+    found = json.loads((out / "cells" / "episodes-taught-B-seed0-in-B.json").read_text())
     assert found["result"]["episodes"] == 40
     assert found["result"]["rate"] > 0.5
 

@@ -22,7 +22,7 @@ def test_runs_are_sorted_by_how_they_were_trained(tmp_path):
     make_run(tmp_path / "three", env="A", reward="paper")
     make_run(tmp_path / "other", task="reach")
     names = [subject.name for subject in merge(find_runs(tmp_path), [])]
-    assert names == ["teacher-B-seed0", "pixels-B-seed0", "pixels-paper-A-seed0"]
+    assert names == ["taught-B-seed0", "pixels-B-seed0", "pixels-paper-A-seed0"]
 
 
 def test_each_seed_of_a_run_is_an_agent(tmp_path):
@@ -40,7 +40,7 @@ def test_shipped_agents_are_there():
 def test_a_shipped_agent_gets_the_curve_of_a_run_without_an_agent():
     root = pathlib.Path(__file__).parents[2]
     subjects = merge(find_runs(root / "benchmarks" / "results"), find_shipped())
-    (agent,) = [x for x in subjects if x.key == ("teacher", "B", 0)]
+    (agent,) = [x for x in subjects if x.key == ("taught", "B", 0)]
     assert agent.agent == "agent-b"
     assert agent.run.name == "agent-b"
 
@@ -49,8 +49,8 @@ def test_an_agent_of_a_run_takes_the_place_of_the_shipped_one(tmp_path):
     make_run(tmp_path / "run", env="B", algorithm="distill", seed=3)
     add_agent(tmp_path / "run")
     names = [x.name for x in merge(find_runs(tmp_path), find_shipped())]
-    assert "teacher-B-seed3" in names
-    assert "teacher-B-seed0" not in names
+    assert "taught-B-seed3" in names
+    assert "taught-B-seed0" not in names
 
 
 def test_two_runs_of_one_seed_are_refused(tmp_path):

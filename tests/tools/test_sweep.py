@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 
 import pytest
+from rich.console import Console
 
 from mjx_arm.cli import main
 from mjx_arm.config import train_config
@@ -53,6 +54,21 @@ CONFIG = train_config(
     select_episodes=2,
 )
 SPACE = (Dimension("task", choices=("never", "always")),)
+
+
+@pytest.mark.slow
+def test_a_trial_that_is_worse_than_the_median_is_pruned(tmp_path, capsys):
+    # With seed 0 the first trial always succeeds, and the second one never does.
+    assert CONFIG.seed == 0
+    first, second = sweep(
+        CONFIG, SPACE, tmp_path / "sweep", trials=2, eval_episodes=2, console=Console()
+    )
+    assert (first.number, first.state, first.value) == (0, "complete", 1.0)
+    assert (second.number, second.state, second.value) == (1, "pruned", None)
+    assert [trial.values["task"] for trial in (first, second)] == ["always", "never"]
+    # Of three chunks, and three selections.
+    assert (len(read_metrics(first.folder)), len(read_metrics(second.folder))) == (3, 1)
+    assert "trial 1: pruned after 80 steps at 0.0 %" in capsys.readouterr().out
 
 
 @pytest.mark.long

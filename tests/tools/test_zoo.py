@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import pathlib
+import re
 
 import pytest
 
@@ -16,7 +18,17 @@ def test_every_shipped_agent_has_a_card_with_its_name():
     assert [agent.name for agent in agents] == shipped_agents()
     for agent in agents:
         assert agent.card.startswith(f"# {agent.name}\n")
-        assert agent.success != "not evaluated"
+
+
+def test_success_is_that_of_the_evaluations():
+    folder = pathlib.Path(__file__).parents[2] / "benchmarks" / "results"
+    for agent in read_zoo():
+        assert set(agent.results) == {"A", "B"}
+        listed = agent.to_json()["results"]
+        for env in agent.results:
+            measured = json.loads((folder / agent.name / f"in_{env}.json").read_text())
+            measured["ci95"] = tuple(measured["ci95"])
+            assert listed[env].items() <= measured.items()
 
 
 def test_agents_lists_them(capsys):
@@ -26,6 +38,8 @@ def test_agents_lists_them(capsys):
     (line,) = [line for line in lines if line.startswith("agent-b ")]
     assert "64×64 pixels of front" in line
     assert "2,506,752" in line
+    # The environment that it was trained in comes first, as on its card.
+    assert re.search(r" \d\d\.\d % of 1,000 in B, \d\d\.\d % of 1,000 in A$", line)
 
 
 def test_agents_prints_json(capsys):

@@ -18,6 +18,7 @@ from mjx_arm.envs.env import make_env
 from mjx_arm.training.agent import (
     _digest,
     add_evaluation,
+    find_agent,
     flatten_params,
     read_agent,
     save_agent,
@@ -110,6 +111,15 @@ def test_parameters_of_another_network_are_rejected(copy):
     reseal(copy, tensors)
     with pytest.raises(ValueError, match="holds the parameters of another network"):
         load_agent(copy)
+
+
+def test_the_card_of_a_shipped_agent_is_the_file_beside_it(tmp_path):
+    shipped = find_agent(pathlib.Path("agent-b"))
+    assert load_agent("agent-b").card == shipped.with_suffix(".md").read_text(encoding="utf-8")
+    copied = tmp_path / shipped.name
+    copied.write_bytes(shipped.read_bytes())
+    copied.with_suffix(".md").write_text("Notes of somebody.")
+    assert load_agent(copied).card == ""
 
 
 def test_an_evaluation_and_a_card_are_part_of_the_file(copy):

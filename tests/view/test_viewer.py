@@ -59,10 +59,11 @@ def save_again(path: pathlib.Path, env_steps: int, scale: float) -> None:
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory) -> pathlib.Path:
-    """A run that still trains: metrics, and the last agent."""
+    """A run that still trains: metrics, the best agent and the last one."""
     folder = tmp_path_factory.mktemp("runs") / "live"
     make_run(folder, env="B")
-    save_again(folder / "last.safetensors", 1_000, 1.0)
+    save_again(folder / "best.safetensors", 500, 1.0)
+    save_again(folder / "last.safetensors", 1_000, 0.9)
     return folder
 
 
@@ -124,6 +125,28 @@ def pause(page) -> None:
     page.get_by_text(re.compile(r"step \d+ · (paused|success|failed)")).wait_for()
 
 
+def choose(page, name: str) -> None:
+    """Chooses an agent; the page shows it some seconds later."""
+    names = ("best", "last", "agent-a", "agent-b")
+    inputs = page.locator("input:not([type=range])").all()
+    next(each for each in inputs if each.input_value() in names).click()
+    page.get_by_role("option", name=name, exact=True).click()
+
+
+def pixel_of(viewer, point) -> np.ndarray:
+    """Where the one visitor sees a point `[3]`, m, of the scene: `[2]`, pixels of the page."""
+    (client,) = viewer.server.get_clients().values()
+    camera = client.camera
+    ahead = np.asarray(camera.look_at) - np.asarray(camera.position)
+    ahead /= np.linalg.norm(ahead)
+    right = np.cross(ahead, np.asarray(camera.up_direction))
+    right /= np.linalg.norm(right)
+    beside = np.asarray(point) - np.asarray(camera.position)
+    across = np.asarray([beside @ right, -beside @ np.cross(right, ahead)]) / (beside @ ahead)
+    half = np.asarray([camera.image_width, camera.image_height]) / 2
+    return half + across * half[1] / np.tan(camera.fov / 2)
+
+
 @pytest.mark.slow
 def test_it_runs_until_it_is_paused(page, viewer):
     wait_until(lambda: viewer.session.step_count >= 3, page)
@@ -181,6 +204,26 @@ def test_the_cube_is_pushed_by_hand(page, viewer):
 
 
 @pytest.mark.slow
+def test_the_cube_is_dragged_while_paused(page, viewer):
+    """By the arrow of its handle that points along y, whose length is 12 cm."""
+    pause(page)
+    before = viewer.session.position("cube")
+    page.wait_for_timeout(500)  # the handle has come to the cube
+    start, end = (pixel_of(viewer, before + np.asarray([0.0, y, 0.0])) for y in (0.06, 0.11))
+    page.mouse.move(*start)
+    page.mouse.down()
+    page.mouse.move(*((start + end) / 2), steps=5)
+    page.mouse.move(*end, steps=5)
+    wait_until(lambda: viewer.session.position("cube")[1] > before[1] + 0.04, page)
+    step = viewer.session.step_count
+    page.mouse.up()
+    page.wait_for_timeout(500)
+    moved = viewer.session.position("cube") - before
+    assert moved == pytest.approx([0.0, 0.05, 0.0], abs=0.01)
+    assert viewer.session.step_count == step
+
+
+@pytest.mark.slow
 def test_another_seed_is_another_episode(page, viewer):
     pause(page)
     seed = viewer.session.seed
@@ -190,8 +233,24 @@ def test_another_seed_is_another_episode(page, viewer):
 
 
 @pytest.mark.slow
+def test_the_best_and_the_last_agent_of_a_run_change_places(page, viewer):
+    pause(page)
+    seed, seen = viewer.session.seed, {}
+    for name, steps in (("last", "1,000"), ("best", "500"), ("last", "1,000")):
+        choose(page, name)
+        page.get_by_text(f"{name}, trained for {steps} steps").wait_for()
+        before = seen.setdefault(name, np.array(viewer.session.seen.q))
+        assert (viewer.session.seen.q == before).all()
+        assert (viewer.session.seed, viewer.session.step_count) == (seed, 0)
+    assert (seen["best"] != seen["last"]).any()
+
+
+@pytest.mark.slow
 def test_a_live_run_is_followed(page, viewer, run):
     pause(page)
+    if page.get_by_text("last, trained for").count() == 0:
+        choose(page, "last")
+        page.get_by_text("last, trained for").wait_for()
     q = np.array(viewer.session.seen.q)
     save_again(run / "last.safetensors", 222_222, 0.5)
     page.get_by_text("trained for 222,222 steps").wait_for()
@@ -202,9 +261,7 @@ def test_a_live_run_is_followed(page, viewer, run):
 @pytest.mark.slow
 def test_another_agent_is_chosen(page, viewer):
     pause(page)
-    inputs = page.locator("input:not([type=range])").all()
-    next(each for each in inputs if each.input_value() == "last").click()
-    page.get_by_role("option", name="agent-b", exact=True).click()
+    choose(page, "agent-b")
     page.get_by_text("agent-b, trained for 2,506,752 steps").wait_for()
     assert viewer.session.simulation.has_agent
 
@@ -233,6 +290,26 @@ def test_it_listens_on_this_machine_alone(viewer):
     if other is not None:
         with pytest.raises(OSError, match=r"refused|unreachable"):
             socket.create_connection((other, viewer.server.get_port()), timeout=5)
+
+
+@pytest.mark.slow
+def test_an_object_that_is_let_go_at_once_stays_where_it_was_held():
+    """Both events of a short drag may come between two steps of the viewer."""
+    viewer = Viewer(ViewOptions(subject=pathlib.Path("arm_push"), port=free_port()))
+    try:
+        viewer._wish("pause", None)
+        viewer.advance()
+        name = viewer.session.objects[0]
+        held = viewer.session.position(name) + np.float32([0.01, 0.02, 0.0])
+        viewer._wish("drag", held)
+        viewer._wish("drag", None)
+        viewer.advance()
+        assert (viewer.session.position(name) == held).all()
+        assert viewer.session.step_count == 0
+        # Nothing but the panel is due while it is paused.
+        assert viewer.advance() > 0.0
+    finally:
+        viewer.close()
 
 
 @pytest.mark.slow
