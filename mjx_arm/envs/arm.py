@@ -33,7 +33,6 @@ class Arm:
       gripper_ctrl: the gripper's command in `ctrl`; its upper end is open, its lower end shut.
       finger_qpos: `[2] int`, addresses of the finger joints in `qpos`.
       grasp_site: site id of the point between the fingers.
-      first_link: body id of the link that the first joint moves.
       home_qpos: `[nq] float32`, the keyframe `home`.
       home_ctrl: `[nu] float32`.
       ctrl_range: `[nu, 2] float32`, lower and upper bounds of `ctrl`.
@@ -45,7 +44,6 @@ class Arm:
     gripper_ctrl: int
     finger_qpos: np.ndarray
     grasp_site: int
-    first_link: int
     home_qpos: np.ndarray
     home_ctrl: np.ndarray
     ctrl_range: np.ndarray
@@ -117,7 +115,6 @@ def resolve_arm(scene: Scene) -> Arm:
         gripper_ctrl=gripper,
         finger_qpos=model.jnt_qposadr[fingers],
         grasp_site=scene.find("site", _SITE),
-        first_link=int(model.jnt_bodyid[joints[0]]),
         home_qpos=model.key_qpos[home].astype(np.float32),
         home_ctrl=model.key_ctrl[home].astype(np.float32),
         ctrl_range=np.stack([_range(scene, servo) for servo in range(model.nu)]),

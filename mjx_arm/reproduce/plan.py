@@ -57,7 +57,6 @@ SECTIONS = {
     "page": "nothing is measured, the page alone is written again",
 }
 _BY_DEFAULT = ("agents", "figure1", "figure2", "figure3", "episodes", "figure4")
-_STUDIES = ("reward", "paper", "ablations")
 # Of the ablations, those that `--quick` tries.
 _QUICK_ABLATIONS = (DEFAULT, "n-step", "size")
 _ENVS = ("A", "B")
