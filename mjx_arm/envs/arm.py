@@ -20,6 +20,12 @@ _JOINT = int(mujoco.mjtTrn.mjTRN_JOINT)
 _TENDON = int(mujoco.mjtTrn.mjTRN_TENDON)
 _HINGE = int(mujoco.mjtJoint.mjJNT_HINGE)
 _SLIDE = int(mujoco.mjtJoint.mjJNT_SLIDE)
+# A servo follows its command at once, or by a filter; integrators and muscles make it another kind.
+_FOLLOWING = (
+    int(mujoco.mjtDyn.mjDYN_NONE),
+    int(mujoco.mjtDyn.mjDYN_FILTER),
+    int(mujoco.mjtDyn.mjDYN_FILTEREXACT),
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -133,7 +139,10 @@ def _check_servo(scene: Scene, servo: int) -> None:
     gain, bias = model.actuator_gainprm[servo], model.actuator_biasprm[servo]
     affine = model.actuator_biastype[servo] == mujoco.mjtBias.mjBIAS_AFFINE
     fixed = model.actuator_gaintype[servo] == mujoco.mjtGain.mjGAIN_FIXED
-    if not (affine and fixed and gain[0] > 0 and bias[1] == -gain[0]):
+    follows = model.actuator_dyntype[servo] in _FOLLOWING
+    # The force kp (ctrl - qpos) - kv qvel, without a constant.
+    linear = gain[0] > 0 and bias[0] == 0 and bias[1] == -gain[0]
+    if not (affine and fixed and follows and linear):
         raise ValueError(
             f"{_label(scene, servo)} is not a position servo: define it by <position kp=... />"
         )
