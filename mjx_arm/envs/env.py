@@ -153,7 +153,7 @@ class Env:
         config, task = self.config, self._task_of(self.varies, state.params)
         action = jnp.asarray(action, jnp.int32)
         wanted = self._commanded(state, action)
-        blocked = self._is_blocked(state, wanted)
+        blocked = self.is_blocked(state.physics.qpos, state.ctrl, wanted, state.params)
         ctrl = jnp.where(blocked, state.ctrl, wanted)
         physics = self.physics.step(state.physics, ctrl, state.params)
         after = dataclasses.replace(state, physics=physics, ctrl=ctrl, step=state.step + 1)
@@ -320,11 +320,23 @@ class Env:
         )
         return jnp.where(action < 0, state.ctrl, wanted) if delayed else wanted
 
-    def _is_blocked(self, state: EnvState, ctrl: jax.Array) -> jax.Array:
-        """Whether a command would take the arm into itself, its base or the ground: `[] bool`."""
-        qpos = self.arm.commanded(state.physics.qpos, ctrl)
-        commanded = self.link_kinematics(qpos, state.params)
-        return self.collision.is_blocked(state.physics.poses, commanded)
+    def is_blocked(
+        self, qpos: jax.Array, ctrl: jax.Array, wanted: jax.Array, params: Params
+    ) -> jax.Array:
+        """Whether a command would take the arm into itself, its base or the ground: `[] bool`.
+
+        Args:
+          qpos: `[nq] float32`, where the fingers are.
+          ctrl: `[nu] float32`, the last command.
+          wanted: `[nu] float32`, the command.
+          params: of the episode.
+        """
+        before, after = (self.arm.commanded(qpos, command) for command in (ctrl, wanted))
+        return self.collision.is_blocked(
+            (before, params),
+            self.link_kinematics(after, params),
+            lambda last: self.link_kinematics(*last),
+        )
 
     def _check_action(self, action: jax.Array | int) -> None:
         if isinstance(action, jax.core.Tracer):
