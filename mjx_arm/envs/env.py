@@ -24,7 +24,7 @@ from mjx_arm.envs.tasks.base import Reward, SizedTask, Task
 from mjx_arm.kinematics import Kinematics, Poses, make_camera_pose, make_kinematics
 from mjx_arm.options import check_name
 from mjx_arm.physics import Physics, make_physics
-from mjx_arm.references import is_reference, load_reference, reference_to
+from mjx_arm.references import is_of_package, is_reference, load_reference, reference_to
 from mjx_arm.render import make_renderer, rgb, segmentation
 from mjx_arm.render.materialize import materialize
 from mjx_arm.render.sensor import entropy_of, make_sensor
@@ -393,18 +393,19 @@ def make_env(config: EnvConfig, *, reward: Reward | None = None, scene: Scene | 
     varies = merge_varies(task.varies, randomiser.varies) if randomiser else task.varies
     shown = image_varies(model, varies) if randomiser else varies
     kinematics = make_kinematics(model, varies)
+    reward = _find_reward(config, task) if reward is None else reward
     # Geoms whose place the task varies mark a place; the arm may pass through them.
     marks = task.varies.get("geom_pos", ())
     largest = randomiser.ranges.cube_size[1]
     obstacles = [dataclasses.replace(x, radius=x.radius * largest) for x in task.obstacles]
     collision = make_self_collision(model, ignored=marks, home=arm.home_qpos)
     around = make_self_collision(model, obstacles=obstacles, ignored=marks, home=arm.home_qpos)
-    return Env(
+    env = Env(
         config=config,
         scene=scene,
         arm=arm,
         task=task,
-        reward=_find_reward(config, task) if reward is None else reward,
+        reward=reward,
         physics=make_physics(
             model,
             config.physics,
@@ -421,11 +422,60 @@ def make_env(config: EnvConfig, *, reward: Reward | None = None, scene: Scene | 
         image_kinematics=make_kinematics(model, shown) if randomiser else kinematics,
         cameras=_make_cameras(scene, config, shown),
     )
+    if is_reference(config.reward) or not is_of_package(reward):
+        _check_reward(env)
+    return env
 
 
 def _remake(config: EnvConfig, reward: Reward | None, name: str, source: SceneSource) -> Env:
     """An environment that was pickled."""
     return make_env(config, reward=reward, scene=compile_scene(name, source))
+
+
+def _check_reward(env: Env) -> None:
+    """Refuses a reward that does not return a dict of named `[] float32` terms.
+
+    Those of the shipped tasks have tests instead: to trace a start takes a moment.
+    """
+    name = f"the reward {reference_to(env.reward)!r}"
+    if not callable(env.reward):
+        raise ValueError(
+            f"the reward {env.config.reward!r} must be a function (before, after, action), "
+            f"got {type(env.reward).__name__}"
+        )
+
+    def check(key: jax.Array) -> None:
+        state = env._start(key, env._sample_placement(key), True)
+        snapshot = Snapshot(state, env.task.measure(state))
+        try:
+            terms: Any = env.reward(snapshot, snapshot, jnp.zeros((), jnp.int32))
+        except Exception as error:  # whatever a user's function raises
+            reason = (str(error).splitlines() or [""])[0]
+            raise ValueError(
+                f"{name} fails when called with (before, after, action): "
+                f"{type(error).__name__}: {reason}"
+            ) from error
+        if not isinstance(terms, dict):
+            raise ValueError(
+                f"{name} must return a dict of named terms, each [] float32, "
+                f"got {type(terms).__name__}"
+            )
+        for term, value in terms.items():
+            _check_term(name, term, value)
+
+    jax.eval_shape(check, jax.random.key(0))
+
+
+def _check_term(name: str, term: Any, value: Any) -> None:
+    if not isinstance(term, str):
+        raise ValueError(f"{name} must name its terms by text, got {term!r}")
+    try:
+        found = jax.eval_shape(lambda: value)
+        said = f"{list(found.shape)} {found.dtype}"
+    except (TypeError, AttributeError):
+        said = type(value).__name__
+    if said != "[] float32":
+        raise ValueError(f"{name}: the term {term!r} must be [] float32, got {said}")
 
 
 def _find_reward(config: EnvConfig, task: Task) -> Reward:
