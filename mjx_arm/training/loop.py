@@ -272,6 +272,15 @@ class Body:
     """The body of the scan, for one seed.
 
     Attributes:
+def _check_q_values(q: jax.Array, num_envs: int, num_actions: int) -> None:
+    """Refuses a network that has another number of actions: the wrong ones would be taken."""
+    if q.shape != (num_envs, num_actions):
+        raise ValueError(
+            f"the network must return Q-values of shape {[num_envs, num_actions]}, one for each "
+            f"action of each observation, got {list(q.shape)}"
+        )
+
+
       config: the options.
       env: the environment, which resets itself.
       algorithm: the algorithm.
@@ -350,6 +359,7 @@ class Body:
         replay = add(
             state.replay,
             Step(
+        _check_q_values(q, self._num_envs, self.env.env.num_actions)
                 frame=frame,
                 action=action.astype(jnp.uint8),
                 reward=transition.reward,
