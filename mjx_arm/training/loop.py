@@ -272,11 +272,6 @@ def check_takes_shard(algorithm: Callable[..., Algorithm], devices: int) -> None
         )
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class Body:
-    """The body of the scan, for one seed.
-
-    Attributes:
 def _check_q_values(q: jax.Array, num_envs: int, num_actions: int) -> None:
     """Refuses a network that has another number of actions: the wrong ones would be taken."""
     if q.shape != (num_envs, num_actions):
@@ -286,6 +281,11 @@ def _check_q_values(q: jax.Array, num_envs: int, num_actions: int) -> None:
         )
 
 
+@dataclasses.dataclass(frozen=True, eq=False)
+class Body:
+    """The body of the scan, for one seed.
+
+    Attributes:
       config: the options.
       env: the environment, which resets itself.
       algorithm: the algorithm.
@@ -359,12 +359,12 @@ def _check_q_values(q: jax.Array, num_envs: int, num_actions: int) -> None:
         epsilon = self.shard.own(spread_epsilon(config.exploration, epsilon, config.num_envs))
         frame = algorithm.frames.encode(state.envs, state.obs)
         q = algorithm.q_values(state.learner, state.obs, frame, env_steps)
+        _check_q_values(q, self._num_envs, self.env.env.num_actions)
         act_key = self.shard.fold(act_key)
         action, envs, transition = act(self.env, act_key, state.envs, q, epsilon)
         replay = add(
             state.replay,
             Step(
-        _check_q_values(q, self._num_envs, self.env.env.num_actions)
                 frame=frame,
                 action=action.astype(jnp.uint8),
                 reward=transition.reward,
