@@ -10,11 +10,17 @@ epsilon        annealed over 1 million        over 1 million environment steps: 
 environments   one                            32 side by side with one replay of 500,000: speed
 updates        not stated                     one of 64 transitions per step of all 32: speed; this
                                               samples two transitions for each environment step
+first update   not stated                     after 5,000 environment steps: batches from a nearly
+                                              empty replay hold the same few transitions
 squared error  (q - y)^2                      (q - y)^2 / 2: Adam's step is the same
 starts in B    joints varied by 20 degrees    sampled again while the arm would touch itself, the
                                               table or the cube: such a start cannot exist
 commands       always carried out             blocked where the arm would touch itself, its base or
                                               the table: a real arm cannot go there
+divergence     not stated                     an episode whose simulation diverges is truncated, and
+                                              its last transition is not learnt from
+judged agent   not stated                     the best of those that are tried on 64 held-out
+                                              episodes every 262,144 steps: a later one can be worse
 evaluation     50 episodes                    1,000, each with a new place for the cube: a narrower
                                               interval
 =============  =============================  =====================================================

@@ -7,6 +7,7 @@ import hashlib
 import importlib
 import inspect
 import pathlib
+import re
 import sys
 from typing import Any
 
@@ -37,6 +38,24 @@ def has_lasting_source(value: Any) -> bool:
     except ValueError:
         return False
     return True
+
+
+def is_of_package(value: Any) -> bool:
+    """Whether an object is defined in this package; of a `functools.partial`, its function."""
+    while isinstance(value, functools.partial):
+        value = value.func
+    return reference_to(value).split(":")[0].split(".")[0] == __name__.split(".")[0]
+
+
+def instance_text(value: Any) -> str:
+    """What an instance, or the object of a bound method, says of its values, in one line.
+
+    Empty for functions and classes, which their source describes. Without addresses in memory, so
+    that every process says the same of the same values.
+    """
+    if inspect.isfunction(value) or inspect.isclass(value):
+        return ""
+    return " ".join(re.sub(r" at 0x[0-9a-fA-F]+", "", repr(value)).split())
 
 
 def load_module(name: str, what: str) -> Any:

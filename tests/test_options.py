@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from pydantic import Field
 
+from mjx_arm import presets
 from mjx_arm.config import (
     TrainConfig,
     advice,
@@ -180,6 +181,18 @@ def test_every_option_can_be_set_by_its_name(preset):
     config = PRESETS[preset]
     for name in flat_names(config):
         assert set_train_options(config, {name: get_option(config, name)}) == config
+
+
+def test_the_table_of_deviations_has_the_numbers_of_the_preset():
+    config, table = PRESETS["paper"], " ".join(presets.__doc__.split())
+    for text in (
+        f"after {config.algo.learning_starts:,} environment steps",
+        f"on {config.select_episodes} held-out episodes",
+        f"every {config.select_every:,} steps",
+        f"{config.num_envs} side by side with one replay of {config.replay.replay_size:,}",
+        f"one of {config.algo.batch_size} transitions per step of all {config.num_envs}",
+    ):
+        assert text in table, text
 
 
 def test_presets_are_never_mutated():

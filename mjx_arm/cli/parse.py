@@ -21,6 +21,7 @@ from mjx_arm.config import TrainConfig, set_train_options
 from mjx_arm.devices import check_device
 from mjx_arm.options import check_name, flat_annotations
 from mjx_arm.presets import PRESETS
+from mjx_arm.training.objects import TOLD, check_told
 from mjx_arm.training.processes import join_processes
 from mjx_arm.training.run_folder import parse_run, read_text
 
@@ -75,7 +76,7 @@ def _start(kind: type[Trains], arguments: Sequence[str]) -> tuple[Trains, dict[s
     These two decide which options there are.
     """
     first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    for name in ("preset", "config", "task", "algorithm"):
+    for name in ("preset", "config", "task", "algorithm", *TOLD):
         first.add_argument(f"--{name}", nargs="?")
     known = first.parse_known_args(arguments)[0]
     preset = known.preset or default_preset()
@@ -84,7 +85,10 @@ def _start(kind: type[Trains], arguments: Sequence[str]) -> tuple[Trains, dict[s
     if known.config is not None:
         if known.preset is not None:
             raise ValueError("--preset and --config exclude each other: give one of them")
-        options = parse_run(read_text(pathlib.Path(known.config)), known.config).config
+        saved = parse_run(read_text(pathlib.Path(known.config)), known.config)
+        told = [name for name in TOLD if getattr(known, name) is not None]
+        check_told(saved.objects, told, known.config)
+        options = saved.config
     parts = {"task": known.task, "algorithm": known.algorithm}
     chosen = {name: value for name, value in parts.items() if value is not None}
     return kind(options=options, preset=preset), chosen

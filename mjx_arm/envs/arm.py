@@ -20,6 +20,12 @@ _JOINT = int(mujoco.mjtTrn.mjTRN_JOINT)
 _TENDON = int(mujoco.mjtTrn.mjTRN_TENDON)
 _HINGE = int(mujoco.mjtJoint.mjJNT_HINGE)
 _SLIDE = int(mujoco.mjtJoint.mjJNT_SLIDE)
+# A servo follows its command at once, or by a filter; integrators and muscles make it another kind.
+_FOLLOWING = (
+    int(mujoco.mjtDyn.mjDYN_NONE),
+    int(mujoco.mjtDyn.mjDYN_FILTER),
+    int(mujoco.mjtDyn.mjDYN_FILTEREXACT),
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,7 +39,6 @@ class Arm:
       gripper_ctrl: the gripper's command in `ctrl`; its upper end is open, its lower end shut.
       finger_qpos: `[2] int`, addresses of the finger joints in `qpos`.
       grasp_site: site id of the point between the fingers.
-      first_link: body id of the link that the first joint moves.
       home_qpos: `[nq] float32`, the keyframe `home`.
       home_ctrl: `[nu] float32`.
       ctrl_range: `[nu, 2] float32`, lower and upper bounds of `ctrl`.
@@ -45,7 +50,6 @@ class Arm:
     gripper_ctrl: int
     finger_qpos: np.ndarray
     grasp_site: int
-    first_link: int
     home_qpos: np.ndarray
     home_ctrl: np.ndarray
     ctrl_range: np.ndarray
@@ -117,7 +121,6 @@ def resolve_arm(scene: Scene) -> Arm:
         gripper_ctrl=gripper,
         finger_qpos=model.jnt_qposadr[fingers],
         grasp_site=scene.find("site", _SITE),
-        first_link=int(model.jnt_bodyid[joints[0]]),
         home_qpos=model.key_qpos[home].astype(np.float32),
         home_ctrl=model.key_ctrl[home].astype(np.float32),
         ctrl_range=np.stack([_range(scene, servo) for servo in range(model.nu)]),
@@ -136,7 +139,10 @@ def _check_servo(scene: Scene, servo: int) -> None:
     gain, bias = model.actuator_gainprm[servo], model.actuator_biasprm[servo]
     affine = model.actuator_biastype[servo] == mujoco.mjtBias.mjBIAS_AFFINE
     fixed = model.actuator_gaintype[servo] == mujoco.mjtGain.mjGAIN_FIXED
-    if not (affine and fixed and gain[0] > 0 and bias[1] == -gain[0]):
+    follows = model.actuator_dyntype[servo] in _FOLLOWING
+    # The force kp (ctrl - qpos) - kv qvel, without a constant.
+    linear = gain[0] > 0 and bias[0] == 0 and bias[1] == -gain[0]
+    if not (affine and fixed and follows and linear):
         raise ValueError(
             f"{_label(scene, servo)} is not a position servo: define it by <position kp=... />"
         )

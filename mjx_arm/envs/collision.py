@@ -8,7 +8,6 @@ not take is blocked before it is given.
 from __future__ import annotations
 
 import dataclasses
-import functools
 import itertools
 from collections.abc import Callable, Sequence
 from typing import Any, TypeAlias
@@ -93,34 +92,39 @@ class Collision:
         """Whether all pairs are at least `margin` apart: `[] bool`."""
         return jnp.all(self.clearances(poses) >= np.float32(self.margin))
 
-    def is_blocked(self, now: Poses, commanded: Poses) -> jax.Array:
+    def is_blocked(
+        self,
+        before: Any,
+        commanded: Poses,
+        poses_of: Callable[[Any], Poses] = lambda poses: poses,
+    ) -> jax.Array:
         """Whether a command must not be given: `[] bool`.
 
-        True where it brings a pair closer than `margin`, and closer than now. So an arm that is
-        already too near, or inside, can always move out.
+        True where it brings a pair closer than `margin`, and closer than the last command does. So
+        an arm that is already too near, or inside, can always move out. The poses that the arm is
+        in do not count: its servos sag and lag, so that it is often nearer than any command.
 
         Args:
-          now: poses at the present state.
+          before: what `poses_of` makes poses of; without it, poses as those of `commanded`.
           commanded: poses of `geoms` alone, with the arm's joints where the command would have
             them.
+          poses_of: makes the same of the last command. It is only called where something is near.
         """
-        blocked: jax.Array = self._is_blocked_many(now, commanded)
-        return blocked
 
-    @functools.cached_property
-    def _is_blocked_many(self) -> Callable[[Poses, Poses], jax.Array]:
         @_called_once
-        def blocked(now: Poses, commanded: Poses) -> jax.Array:
+        def blocked(before: Any, commanded: Poses) -> jax.Array:
             after = jax.vmap(self.clearances_of_geoms)(commanded)
             near = after < np.float32(self.margin)
 
             def closer() -> jax.Array:
-                return near & (after < jax.vmap(self.clearances)(now) - np.float32(_SAME))
+                last = jax.vmap(self.clearances_of_geoms)(jax.vmap(poses_of)(before))
+                return near & (after < last - np.float32(_SAME))
 
             # In most steps no arm of the batch is near anything.
             return jnp.any(jax.lax.cond(jnp.any(near), closer, lambda: near), axis=-1)
 
-        return blocked
+        found: jax.Array = blocked(before, commanded)
+        return found
 
 
 def _called_once(function: Callable[..., jax.Array]) -> Callable[..., jax.Array]:

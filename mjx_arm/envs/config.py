@@ -13,7 +13,6 @@ from mjx_arm.options import (
     Positive,
     Size,
     check_value,
-    flat_names,
     options,
     set_options,
 )
@@ -136,8 +135,3 @@ def set_env_options(config: EnvConfig, values: dict[str, Any]) -> EnvConfig:
     if task != config.task:
         config = dataclasses.replace(config, task=task, task_options=find_task(task).config())
     return set_options(config, values)
-
-
-def env_option_names(config: EnvConfig) -> list[str]:
-    """Names of all options, those of the task included."""
-    return list(flat_names(config))

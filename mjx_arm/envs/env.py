@@ -24,7 +24,7 @@ from mjx_arm.envs.tasks.base import Reward, SizedTask, Task
 from mjx_arm.kinematics import Kinematics, Poses, make_camera_pose, make_kinematics
 from mjx_arm.options import check_name
 from mjx_arm.physics import Physics, make_physics
-from mjx_arm.references import is_reference, load_reference, reference_to
+from mjx_arm.references import is_of_package, is_reference, load_reference, reference_to
 from mjx_arm.render import make_renderer, rgb, segmentation
 from mjx_arm.render.materialize import materialize
 from mjx_arm.render.sensor import entropy_of, make_sensor
@@ -153,7 +153,7 @@ class Env:
         config, task = self.config, self._task_of(self.varies, state.params)
         action = jnp.asarray(action, jnp.int32)
         wanted = self._commanded(state, action)
-        blocked = self._is_blocked(state, wanted)
+        blocked = self.is_blocked(state.physics.qpos, state.ctrl, wanted, state.params)
         ctrl = jnp.where(blocked, state.ctrl, wanted)
         physics = self.physics.step(state.physics, ctrl, state.params)
         after = dataclasses.replace(state, physics=physics, ctrl=ctrl, step=state.step + 1)
@@ -320,11 +320,23 @@ class Env:
         )
         return jnp.where(action < 0, state.ctrl, wanted) if delayed else wanted
 
-    def _is_blocked(self, state: EnvState, ctrl: jax.Array) -> jax.Array:
-        """Whether a command would take the arm into itself, its base or the ground: `[] bool`."""
-        qpos = self.arm.commanded(state.physics.qpos, ctrl)
-        commanded = self.link_kinematics(qpos, state.params)
-        return self.collision.is_blocked(state.physics.poses, commanded)
+    def is_blocked(
+        self, qpos: jax.Array, ctrl: jax.Array, wanted: jax.Array, params: Params
+    ) -> jax.Array:
+        """Whether a command would take the arm into itself, its base or the ground: `[] bool`.
+
+        Args:
+          qpos: `[nq] float32`, where the fingers are.
+          ctrl: `[nu] float32`, the last command.
+          wanted: `[nu] float32`, the command.
+          params: of the episode.
+        """
+        before, after = (self.arm.commanded(qpos, command) for command in (ctrl, wanted))
+        return self.collision.is_blocked(
+            (before, params),
+            self.link_kinematics(after, params),
+            lambda last: self.link_kinematics(*last),
+        )
 
     def _check_action(self, action: jax.Array | int) -> None:
         if isinstance(action, jax.core.Tracer):
@@ -381,18 +393,19 @@ def make_env(config: EnvConfig, *, reward: Reward | None = None, scene: Scene | 
     varies = merge_varies(task.varies, randomiser.varies) if randomiser else task.varies
     shown = image_varies(model, varies) if randomiser else varies
     kinematics = make_kinematics(model, varies)
+    reward = _find_reward(config, task) if reward is None else reward
     # Geoms whose place the task varies mark a place; the arm may pass through them.
     marks = task.varies.get("geom_pos", ())
     largest = randomiser.ranges.cube_size[1]
     obstacles = [dataclasses.replace(x, radius=x.radius * largest) for x in task.obstacles]
     collision = make_self_collision(model, ignored=marks, home=arm.home_qpos)
     around = make_self_collision(model, obstacles=obstacles, ignored=marks, home=arm.home_qpos)
-    return Env(
+    env = Env(
         config=config,
         scene=scene,
         arm=arm,
         task=task,
-        reward=_find_reward(config, task) if reward is None else reward,
+        reward=reward,
         physics=make_physics(
             model,
             config.physics,
@@ -409,11 +422,60 @@ def make_env(config: EnvConfig, *, reward: Reward | None = None, scene: Scene | 
         image_kinematics=make_kinematics(model, shown) if randomiser else kinematics,
         cameras=_make_cameras(scene, config, shown),
     )
+    if is_reference(config.reward) or not is_of_package(reward):
+        _check_reward(env)
+    return env
 
 
 def _remake(config: EnvConfig, reward: Reward | None, name: str, source: SceneSource) -> Env:
     """An environment that was pickled."""
     return make_env(config, reward=reward, scene=compile_scene(name, source))
+
+
+def _check_reward(env: Env) -> None:
+    """Refuses a reward that does not return a dict of named `[] float32` terms.
+
+    Those of the shipped tasks have tests instead: to trace a start takes a moment.
+    """
+    name = f"the reward {reference_to(env.reward)!r}"
+    if not callable(env.reward):
+        raise ValueError(
+            f"the reward {env.config.reward!r} must be a function (before, after, action), "
+            f"got {type(env.reward).__name__}"
+        )
+
+    def check(key: jax.Array) -> None:
+        state = env._start(key, env._sample_placement(key), True)
+        snapshot = Snapshot(state, env.task.measure(state))
+        try:
+            terms: Any = env.reward(snapshot, snapshot, jnp.zeros((), jnp.int32))
+        except Exception as error:  # whatever a user's function raises
+            reason = (str(error).splitlines() or [""])[0]
+            raise ValueError(
+                f"{name} fails when called with (before, after, action): "
+                f"{type(error).__name__}: {reason}"
+            ) from error
+        if not isinstance(terms, dict):
+            raise ValueError(
+                f"{name} must return a dict of named terms, each [] float32, "
+                f"got {type(terms).__name__}"
+            )
+        for term, value in terms.items():
+            _check_term(name, term, value)
+
+    jax.eval_shape(check, jax.random.key(0))
+
+
+def _check_term(name: str, term: Any, value: Any) -> None:
+    if not isinstance(term, str):
+        raise ValueError(f"{name} must name its terms by text, got {term!r}")
+    try:
+        found = jax.eval_shape(lambda: value)
+        said = f"{list(found.shape)} {found.dtype}"
+    except (TypeError, AttributeError):
+        said = type(value).__name__
+    if said != "[] float32":
+        raise ValueError(f"{name}: the term {term!r} must be [] float32, got {said}")
 
 
 def _find_reward(config: EnvConfig, task: Task) -> Reward:

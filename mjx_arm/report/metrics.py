@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import pathlib
 import time
 from types import TracebackType
-from typing import Self
+from typing import Any, NoReturn, Self
 
 from tensorboardX.event_file_writer import EventsWriter
 from tensorboardX.proto.event_pb2 import Event
 from tensorboardX.summary import scalar
+
+# Metrics that every row has as numbers; others may be null.
+_ALWAYS = ("env_steps", "wall_s", "episodes", "successes")
+_NUMBERS = (int, float)
 
 
 class MetricsWriter:
@@ -86,7 +91,7 @@ def read_metrics(folder: pathlib.Path) -> list[dict[str, float]]:
     """Reads `metrics.jsonl` of a run folder; null becomes NaN.
 
     Raises:
-      ValueError: the folder holds no metrics.
+      ValueError: the folder holds no metrics, or a line is damaged.
     """
     path = folder / "metrics.jsonl"
     if not path.is_file():
@@ -98,7 +103,23 @@ def read_metrics(folder: pathlib.Path) -> list[dict[str, float]]:
 
 
 def _read_rows(path: pathlib.Path) -> list[dict[str, float]]:
-    return [_parse_row(path, i + 1, line) for i, line in enumerate(_whole_lines(path))]
+    rows = [_parse_row(path, i + 1, line) for i, line in enumerate(_whole_lines(path))]
+    _check_names(path, rows)
+    return rows
+
+
+def _check_names(path: pathlib.Path, rows: list[dict[str, float]]) -> None:
+    """Refuses a row that lacks a metric of a row before it, and a first row without one of all.
+
+    A later row may have more than those before it: another version has continued the run.
+    """
+    later = [name for name in rows[-1] if all(name in row for row in rows[1:])] if rows else []
+    known: dict[str, None] = dict.fromkeys(later)
+    for number, row in enumerate(rows, start=1):
+        for name in known:
+            if name not in row:
+                raise _damaged(path, number, f": it lacks {name!r}, which other lines have")
+        known = dict.fromkeys(row) if number == 1 else known | dict.fromkeys(row)
 
 
 def _whole_lines(path: pathlib.Path) -> list[bytes]:
@@ -107,11 +128,23 @@ def _whole_lines(path: pathlib.Path) -> list[bytes]:
 
 
 def _parse_row(path: pathlib.Path, number: int, line: bytes) -> dict[str, float]:
-    try:
-        row = json.loads(line)
-        known = isinstance(row, dict) and all(name in row for name in ("env_steps", "wall_s"))
-        if known and all(x is None or type(x) in (int, float) for x in row.values()):
+    with contextlib.suppress(ValueError, OverflowError, RecursionError):
+        row = json.loads(line, parse_constant=_refuse)
+        if isinstance(row, dict) and _has_numbers(row):
             return {name: math.nan if x is None else x for name, x in row.items()}
-    except (ValueError, RecursionError):
-        pass
-    raise ValueError(f"{path}, line {number} is damaged: restore it, or remove the line")
+    raise _damaged(path, number)
+
+
+def _has_numbers(row: dict[str, Any]) -> bool:
+    """Whether a row has finite numbers and null alone; OverflowError where no float holds one."""
+    always = all(type(row.get(name)) in _NUMBERS for name in _ALWAYS)
+    known = [x for x in row.values() if x is not None]
+    return always and all(type(x) in _NUMBERS and not math.isinf(x) for x in known)
+
+
+def _refuse(constant: str) -> NoReturn:
+    raise ValueError(constant)
+
+
+def _damaged(path: pathlib.Path, number: int, why: str = "") -> ValueError:
+    return ValueError(f"{path}, line {number} is damaged{why}: restore it, or remove the line")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import collections
 import copy
 import dataclasses
+import functools
 from collections.abc import Sequence
 
 import jax
@@ -151,7 +152,8 @@ class StandIn:
         self.data = mujoco.MjData(self.model)
         self.ctrl = env.arm.home_ctrl.copy()
         self._steps = _step_table(env, 1 - offsets.short_step)
-        self._blocks = jax.jit(self._blocked_by)
+        params = own_params(env.scene.mj_model, env.varies)
+        self._blocks = jax.jit(functools.partial(env.is_blocked, params=params))
         self._grasps = jax.jit(lambda poses, ctrl: grasped(self._task, poses, ctrl))
         self._cameras = Cameras(
             self.model,
@@ -192,7 +194,7 @@ class StandIn:
         elif action == arm.close_action:
             wanted[arm.gripper_ctrl] = low[arm.gripper_ctrl]
         wanted = np.clip(wanted, low, high)
-        if self._blocks(self._poses(), self.data.qpos.astype(np.float32), wanted):
+        if self._blocks(self.data.qpos.astype(np.float32), self.ctrl, wanted):
             return False
         self.ctrl = wanted
         return True
@@ -263,12 +265,6 @@ class StandIn:
         arrays = data.geom_xpos, data.geom_xmat.reshape(-1, 3, 3), data.site_xpos
         xpos, xmat, sites = (np.asarray(x, np.float32) for x in arrays)
         return Poses(geom_xpos=xpos, geom_xmat=xmat, site_xpos=sites)  # type: ignore[arg-type]
-
-    def _blocked_by(self, now: Poses, qpos: jax.Array, wanted: jax.Array) -> jax.Array:
-        env = self.env
-        params = own_params(env.scene.mj_model, env.varies)
-        commanded = env.link_kinematics(env.arm.commanded(qpos, wanted), params)
-        return env.collision.is_blocked(now, commanded)
 
 
 def check_env(env: Env) -> None:

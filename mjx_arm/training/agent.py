@@ -27,6 +27,7 @@ from mjx_arm.options import flat_names, get_option, invalid, set_options
 from mjx_arm.scene import Scene, SceneSource, compile_scene, load_scene, read_source, scene_exists
 from mjx_arm.training.algorithm import make_algorithm
 from mjx_arm.training.objects import Objects, Record, check_record
+from mjx_arm.training.run_folder import CONFIG, load_run
 
 _FORMAT = "mjx_arm agent 2"
 LAST, BEST = "last.safetensors", "best.safetensors"
@@ -347,7 +348,7 @@ def find_agent(path: pathlib.Path) -> pathlib.Path:
     """The agent's file that a path means, or the name of an agent that comes with the package.
 
     Raises:
-      ValueError: there is none.
+      ValueError: there is none, or the run is of another version.
     """
     shipped = _AGENTS / f"{path}.safetensors"
     if not path.exists() and str(path) in shipped_agents():
@@ -357,7 +358,8 @@ def find_agent(path: pathlib.Path) -> pathlib.Path:
     for name in (BEST, LAST):
         if (path / name).is_file():
             return path / name
-    if (path / "config.json").is_file():
+    if (path / CONFIG).is_file():
+        load_run(path)  # refuses runs of other versions, whose agents have other names
         seeds = ", ".join(sorted(str(seed) for seed in path.glob("seed-*")))
         hint = f"give one of {seeds}" if seeds else "the run has not saved one yet"
         raise ValueError(f"{path} holds no agent: {hint}")

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+import flax.linen as nn
+
 from mjx_arm.algos.base import Algorithm
 from mjx_arm.algos.distill import Distill
 from mjx_arm.algos.dqn import DQN, QLearning, make_adam, make_q_learning
@@ -11,6 +13,7 @@ from mjx_arm.algos.frames import make_frames
 from mjx_arm.config import DistillConfig, DQNConfig, TrainConfig
 from mjx_arm.envs.env import Env
 from mjx_arm.networks import FeatureQNetwork, make_network
+from mjx_arm.references import reference_to
 from mjx_arm.shard import WHOLE, Shard
 
 
@@ -28,7 +31,7 @@ def make_algorithm(
         then runs inside `jax.shard_map` and averages its gradients over all parts.
 
     Raises:
-      ValueError: the network cannot be made.
+      ValueError: the network cannot be made, or is not a Flax module.
     """
     from_state = config.env.observation == "state"
     if network is None:
@@ -36,6 +39,12 @@ def make_algorithm(
             config.network,
             num_actions=env.num_actions,
             feature_scales=env.feature_scales if from_state else None,
+        )
+    if not isinstance(network, nn.Module):
+        name = config.network.network or reference_to(network)
+        raise ValueError(
+            f"network {name!r} must be a Flax module, got an object of type "
+            f"{type(network).__name__}"
         )
     storage, algo = config.replay.storage, config.algo
     if isinstance(algo, DistillConfig):

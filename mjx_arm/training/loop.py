@@ -17,12 +17,13 @@ from mjx_arm.algos.base import Algorithm
 from mjx_arm.algos.collect import Counts, Episodes, act, count_episodes, init_episodes, means
 from mjx_arm.algos.exploration import epsilon_at, spread_epsilon
 from mjx_arm.algos.replay import Replay, Step, add, init_replay
-from mjx_arm.config import TrainConfig
+from mjx_arm.config import TrainConfig, set_train_options
 from mjx_arm.envs.auto_reset import AutoReset, AutoResetState
 from mjx_arm.envs.env import Env, make_env
 from mjx_arm.envs.tasks.base import Reward
 from mjx_arm.microbatch import microbatched, overwrite_microbatched
 from mjx_arm.physics import compiler_options
+from mjx_arm.references import reference_to
 from mjx_arm.shard import WHOLE, Shard
 from mjx_arm.training.algorithm import make_algorithm
 from mjx_arm.training.mesh import (
@@ -242,6 +243,10 @@ def make_body(
     check_division(dataclasses.replace(config, num_seeds=1), shard.count)
     if env is not None and reward is not None:
         raise ValueError("env= and reward= exclude each other: make env with the reward")
+    # What was passed as an object has its import path in the options, as `mjx_arm.make` has it.
+    passed = {"reward": reward, "network": network}
+    paths = {name: reference_to(value) for name, value in passed.items() if value is not None}
+    config = set_train_options(config, paths)
     own = make_env(config.env, reward=reward) if env is None else env
     config = dataclasses.replace(config, env=own.config)
     if algorithm is None:
@@ -264,6 +269,15 @@ def check_takes_shard(algorithm: Callable[..., Algorithm], devices: int) -> None
         raise ValueError(
             f"algorithm must be a function (config, env, *, shard) to share a seed among {devices} "
             "devices: average its gradients by shard.mean, or train on one device"
+        )
+
+
+def _check_q_values(q: jax.Array, num_envs: int, num_actions: int) -> None:
+    """Refuses a network that has another number of actions: the wrong ones would be taken."""
+    if q.shape != (num_envs, num_actions):
+        raise ValueError(
+            f"the network must return Q-values of shape {[num_envs, num_actions]}, one for each "
+            f"action of each observation, got {list(q.shape)}"
         )
 
 
@@ -345,6 +359,7 @@ class Body:
         epsilon = self.shard.own(spread_epsilon(config.exploration, epsilon, config.num_envs))
         frame = algorithm.frames.encode(state.envs, state.obs)
         q = algorithm.q_values(state.learner, state.obs, frame, env_steps)
+        _check_q_values(q, self._num_envs, self.env.env.num_actions)
         act_key = self.shard.fold(act_key)
         action, envs, transition = act(self.env, act_key, state.envs, q, epsilon)
         replay = add(

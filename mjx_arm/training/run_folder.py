@@ -18,7 +18,7 @@ import jax
 from mjx_arm.config import TrainConfig, dump_config, parse_config
 from mjx_arm.scene import SceneSource
 from mjx_arm.training.checkpoint import Origin, RunCheckpoints, config_differences
-from mjx_arm.training.objects import Record
+from mjx_arm.training.objects import Record, parse_record
 from mjx_arm.training.seal import is_sealed, seal
 
 CONFIG = "config.json"
@@ -96,12 +96,14 @@ def parse_run(text: str, where: str) -> SavedRun:
       ValueError: it is not the configuration of a run of this version.
     """
     intact = is_sealed(text)
-    objects, run_id, scene = {}, "", SceneSource("")
+    objects: Record = {}
+    run_id, scene = "", SceneSource("")
     with contextlib.suppress(json.JSONDecodeError, RecursionError):
         values = json.loads(text)
         if isinstance(values, dict):
             values.pop("sha256", None)
-            objects, run_id = values.pop("objects", {}), values.pop("run_id", "")
+            objects = parse_record(values.pop("objects", {}), where)
+            run_id = values.pop("run_id", "")
             source = values.pop("scene_source", None)
             scene = SceneSource.from_json(source, where) if intact else scene
             text = json.dumps(values)

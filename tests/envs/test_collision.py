@@ -115,10 +115,13 @@ def test_a_command_out_of_the_table_is_never_blocked():
     home = model.key_qpos[0].astype(np.float32)
     lowest = np.flatnonzero([model.joint(j).name == "shoulder" for j in range(model.njnt)])[0]
 
-    def poses(degrees: float):
+    def qpos_at(degrees: float):
         qpos = home.copy()
         qpos[model.jnt_qposadr[lowest]] += np.deg2rad(degrees)
-        return kinematics(jnp.asarray(qpos))
+        return jnp.asarray(qpos)
+
+    def poses(degrees: float):
+        return kinematics(qpos_at(degrees))
 
     def links(degrees):
         of_all = poses(degrees)
@@ -128,10 +131,10 @@ def test_a_command_out_of_the_table_is_never_blocked():
 
     assert collision.is_free(poses(0))
     assert not collision.is_free(poses(40))
-    assert collision.is_blocked(poses(39), links(40))
-    assert not collision.is_blocked(poses(40), links(39))
-    assert not collision.is_blocked(poses(40), links(40))
-    assert not collision.is_blocked(poses(0), links(1))
+    of_links = make_kinematics(model, geoms=collision.geoms.tolist())
+    for last, now, blocked in ((39, 40, True), (40, 39, False), (40, 40, False), (0, 1, False)):
+        assert collision.is_blocked(links(last), links(now)) == blocked
+        assert collision.is_blocked(qpos_at(last), links(now), of_links) == blocked
 
 
 def test_an_obstacle_is_a_sphere_at_its_geom():
@@ -165,12 +168,14 @@ def test_commands_of_a_batch_are_blocked_one_by_one():
     qpos = jnp.asarray(random_poses(model)[:64])
     # Some come nearer to something, others go away from it.
     arm = qpos.at[:, : model.nu].add(jnp.where(jnp.arange(64) % 2 == 0, 0.1, -0.1)[:, None])
-    now, commanded = (jax.vmap(kinematics)(x) for x in (qpos, arm))
-    links = commanded.replace(
-        geom_xpos=commanded.geom_xpos[:, collision.geoms],
-        geom_xmat=commanded.geom_xmat[:, collision.geoms],
+    poses = [jax.vmap(kinematics)(x) for x in (qpos, arm)]
+    now, links = (
+        x.replace(
+            geom_xpos=x.geom_xpos[:, collision.geoms], geom_xmat=x.geom_xmat[:, collision.geoms]
+        )
+        for x in poses
     )
-    before, after = (np.asarray(jax.vmap(collision.clearances)(x)) for x in (now, commanded))
+    before, after = (np.asarray(jax.vmap(collision.clearances)(x)) for x in poses)
     wanted = ((after < collision.margin) & (after < before - 5e-6)).any(axis=-1)
     assert 5 < wanted.sum() < 59
     batch = jax.jit(jax.vmap(collision.is_blocked))(now, links)

@@ -189,6 +189,41 @@ def test_bad_options_are_refused_in_one_sentence(name, options, message):
     assert "\n" not in str(raised.value)
 
 
+@pytest.mark.parametrize(
+    ("reward", "message"),
+    [
+        ("os:path", "the reward 'os:path' must be a function .*, got module"),
+        (
+            "mjx_arm.envs.tasks.lift:paper_reward",
+            "fails when called with .*: TypeError: .* missing",
+        ),
+        ("json:dumps", r"'json:dumps' fails when called with \(before, after, action\): TypeError"),
+        (lambda *step: [1.0], "must return a dict of named terms, each .*, got list"),
+        (
+            lambda *step: {"far": jnp.zeros(3)},
+            r"term 'far' must be \[\] float32, got \[3\] float32",
+        ),
+        (lambda *step: {"near": True}, r"term 'near' must be \[\] float32, got \[\] bool"),
+        (lambda *step: {"none": None}, r"term 'none' must be \[\] float32, got NoneType"),
+        (lambda *step: {"text": "much"}, r"term 'text' must be \[\] float32, got str"),
+        (lambda *step: {3: jnp.zeros(())}, "must name its terms by text, got 3"),
+        (lambda before, after, action: after.measured["hight"], "fails when .* KeyError: 'hight'"),
+    ],
+)
+def test_a_reward_that_returns_no_terms_is_refused_by_name(reward, message):
+    with pytest.raises(ValueError, match=message) as raised:
+        mjx_arm.make("A", reward=reward, physics="native", observation="state")
+    assert "\n" not in str(raised.value)
+
+
+def test_a_reward_may_return_plain_numbers():
+    reward = lambda before, after, action: {"one": 1.0, "high": 2.0 * after.measured["height"]}  # noqa: E731
+    env = mjx_arm.make("A", reward=reward, physics="native", observation="state")
+    _, state = jax.eval_shape(env.reset, jax.random.key(0))
+    reward = jax.eval_shape(env.step, jax.random.key(0), state, jnp.int32(0))[2]
+    assert (reward.shape, reward.dtype) == ((), jnp.float32)
+
+
 def test_a_scene_without_the_names_of_the_task_is_refused(tmp_path):
     path = tmp_path / "ball.xml"
     path.write_text('<mujoco><worldbody><geom type="sphere" size="1"/></worldbody></mujoco>')

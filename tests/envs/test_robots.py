@@ -278,9 +278,26 @@ def test_the_slopes_of_the_tool_are_its_derivatives(name, load):
     np.testing.assert_allclose(slopes, expected, atol=1e-5)
 
 
-def servos(**attributes: str) -> str:
+def servos(kind: str = "position", **attributes: str) -> str:
     text = " ".join(f'{name}="{value}"' for name, value in attributes.items())
-    return f'<position name="j0" joint="j0" {text}/>'
+    return f'<{kind} name="j0" joint="j0" {text}/>'
+
+
+def general(**attributes: str) -> str:
+    return servos("general", ctrlrange="-1 1", biastype="affine", gainprm="9", **attributes)
+
+
+@pytest.mark.parametrize(
+    "servo",
+    [
+        servos(kp="9", kv="1", ctrlrange="-1 1"),
+        servos(kp="9", ctrlrange="-1 1", timeconst="0.1"),
+        general(biasprm="0 -9 -1", dyntype="filter", dynprm="0.1"),
+    ],
+)
+def test_a_position_servo_with_or_without_a_filter_is_taken(servo, load):
+    arm = resolve_arm(load(mjcf(TURN_Y, servos=servo)))
+    np.testing.assert_allclose(arm.ctrl_range[0], [-1.0, 1.0])
 
 
 @pytest.mark.parametrize(
@@ -293,6 +310,18 @@ def servos(**attributes: str) -> str:
         ),
         (
             {"servos": '<velocity name="j0" joint="j0" kv="9" ctrlrange="-1 1"/>'},
+            "actuator 'j0' is not a position servo",
+        ),
+        (
+            {"servos": servos("intvelocity", kp="9", actrange="-1 1", ctrlrange="-1 1")},
+            "actuator 'j0' is not a position servo",
+        ),
+        (
+            {"servos": general(biasprm="1 -9 0")},
+            "actuator 'j0' is not a position servo",
+        ),
+        (
+            {"servos": general(biasprm="0 -9 0", dyntype="integrator", actrange="-1 1")},
             "actuator 'j0' is not a position servo",
         ),
         (

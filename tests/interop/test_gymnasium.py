@@ -7,6 +7,8 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 
 import mjx_arm.interop
+from mjx_arm.envs import tasks
+from mjx_arm.envs.tasks.reach import Reach, ReachConfig
 
 OPTIONS = {"physics": "native", "size": (16, 16), "max_steps": 4}
 SHOULDER_UP = 2
@@ -132,10 +134,46 @@ def test_a_mask_restricts_the_reset_to_some_environments():
         env.reset(options={"reset_mask": np.ones(2, bool)})
 
 
-def test_each_task_is_registered():
-    for name in ("mjx_arm/LiftA-v0", "mjx_arm/LiftB-v0"):
-        env = gymnasium.make(name, observation="state", **OPTIONS).unwrapped
-        assert (env.env.config.task, env.env.config.env) == ("lift", name[-4])
+@pytest.mark.parametrize("task", ["lift", "reach", "push"])
+def test_each_task_is_registered(task):
+    for name in ("A", "B"):
+        made = gymnasium.make(f"mjx_arm/{task.title()}{name}-v0", observation="state", **OPTIONS)
+        config = made.unwrapped.env.config
+        assert (config.task, config.env) == (task, name)
+
+
+@pytest.fixture
+def later(monkeypatch):
+    """Registers a task that leaves again with the test."""
+    known = dict(tasks._tasks)
+    monkeypatch.setattr(tasks, "_tasks", known)
+    ids = dict(gymnasium.registry)
+    yield lambda name, make: mjx_arm.register(name, make, config=ReachConfig, scene="arm_reach")
+    for name in set(gymnasium.registry) - set(ids):
+        del gymnasium.registry[name]
+
+
+def test_a_task_that_is_registered_later_has_its_ids(later):
+    later("point_there", Reach)
+    later("point_there", Reach)  # once more is the same
+    env = gymnasium.make("mjx_arm/PointThereB-v0", observation="state", **OPTIONS).unwrapped
+    assert isinstance(env.env.task, Reach)
+    assert (env.env.config.task, env.env.config.env) == ("point_there", "B")
+
+
+def test_a_task_with_the_ids_of_another_is_refused_and_not_registered(later):
+    later("point_there", Reach)
+    for name in ("arm_cube", "point__there"):
+        with pytest.raises(ValueError, match=r"the gymnasium id 'mjx_arm/.*A-v0' of another task"):
+            later(name, Reach)
+        assert name not in tasks.task_names()
+    assert gymnasium.spec("mjx_arm/ArmCubeA-v0").kwargs["task"] == "lift"
+
+
+@pytest.mark.parametrize("name", ["", "own:task", "own task", "7", None])
+def test_a_name_that_cannot_be_an_id_is_refused(name, later):
+    with pytest.raises(ValueError, match="the name of a task must be a letter, then letters"):
+        later(name, Reach)
 
 
 def test_bad_vector_options_are_refused():

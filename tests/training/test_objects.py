@@ -8,9 +8,14 @@ import sys
 
 import pytest
 
+from mjx_arm.cli.parse import parse
+from mjx_arm.cli.process import main
 from mjx_arm.config import train_config
+from mjx_arm.envs import tasks
 from mjx_arm.references import reference_to
-from mjx_arm.training.objects import Objects, check_record, only_here, record
+from mjx_arm.scene import load_scene
+from mjx_arm.training.objects import Objects, check_record, only_here, parse_record, record
+from mjx_arm.training.run_folder import SavedRun, save_run
 
 MODULE = """
 import flax.linen as nn
@@ -26,10 +31,26 @@ def other(before, after, action):
 
 class Net(nn.Module):
     num_actions: int = 14
+    activation: object = nn.relu
 
     @nn.compact
     def __call__(self, obs):
-        return nn.Dense(self.num_actions)(obs)
+        return nn.Dense(self.num_actions)(self.activation(obs))
+
+
+class OwnTask:
+    pass
+
+
+class Pay:
+    def __init__(self, much):
+        self.much = much
+
+    def __repr__(self):
+        return f"Pay({self.much})"
+
+    def reward(self, before, after, action):
+        return {"pay": self.much + 0.0 * after.measured["height"]}
 """
 
 SCRIPT = """
@@ -97,8 +118,9 @@ def test_an_unexpected_one_is_refused(own):
         check_record({}, train_config(), Objects(reward=own.reward), "here")
 
 
-def change_source(own, tmp_path) -> None:
-    (tmp_path / "own_parts.py").write_text(MODULE.replace("0.0 *", "1.0 *"))
+def change_source(own, tmp_path, old="0.0 *", new="1.0 *") -> None:
+    assert old in MODULE
+    (tmp_path / "own_parts.py").write_text(MODULE.replace(old, new))
     import linecache
 
     linecache.checkcache()
@@ -121,6 +143,123 @@ def test_what_a_configuration_names_is_recorded_and_checked(own, tmp_path):
     change_source(own, tmp_path)
     with pytest.raises(ValueError, match="reward=own_parts:reward, whose source has changed"):
         check_record(found, config, Objects(), "here")
+
+
+def test_the_values_of_an_instance_count(own):
+    config = train_config()
+    for first, other in (
+        (Objects(network=own.Net()), Objects(network=own.Net(num_actions=3))),
+        (Objects(network=own.Net()), Objects(network=own.Net(activation=len))),
+        (Objects(reward=own.Pay(1).reward), Objects(reward=own.Pay(2).reward)),
+    ):
+        found = record(config, first)
+        check_record(found, config, first, "here")
+        ((name, entry),) = found.items()
+        assert " at 0x" not in entry["repr"]
+        with pytest.raises(ValueError, match=rf"here was made with {name}=.*, got .*: pass the"):
+            check_record(found, config, other, "here")
+        # Records of the version before have no values.
+        del entry["repr"]
+        check_record(found, config, other, "here")
+
+
+@pytest.fixture
+def register(monkeypatch):
+    """Registers a task that leaves again with the test."""
+    monkeypatch.setattr(tasks, "_tasks", dict(tasks._tasks))
+    return tasks.register
+
+
+def test_a_registered_task_that_is_not_of_the_package_counts(own, register, tmp_path):
+    register("own_task", own.OwnTask)
+    config = train_config(task="own_task")
+    found = record(config, Objects())
+    assert found["task"]["path"] == "own_parts:OwnTask"
+    assert only_here(found) == []
+    check_record(found, config, Objects(), "here")
+    assert record(train_config(task="reach", reward=""), Objects()) == {}
+    change_source(own, tmp_path, "    pass", "    lift = 0.2")
+    with pytest.raises(ValueError, match="task=own_parts:OwnTask, whose source has changed since"):
+        check_record(found, config, Objects(), "here")
+
+
+def test_a_registered_task_that_no_file_has_counts_in_this_process_alone(register):
+    register("local_task", make_local())
+    config = train_config(task="local_task")
+    found = record(config, Objects())
+    assert len(only_here(found)) == 1
+    check_record(found, config, Objects(), "here")
+    found["task"]["only_in"] = "the token of another process"
+    with pytest.raises(ValueError, match=r"task=.*, which only the process that made it had"):
+        check_record(found, config, Objects(), "here")
+
+
+def test_the_reward_of_an_own_environment_is_the_one_that_it_has(own):
+    """The environment was made with it; nobody else may have it."""
+    for reward, lasting in ((own.reward, True), (make_local(), False)):
+        config = train_config(reward=reference_to(reward))
+        env = OwnEnv(config.env, reward)
+        found = record(config, Objects(env=env))
+        assert set(found) == {"env", "reward"}
+        assert found["reward"]["path"] == reference_to(reward)
+        assert (only_here(found) == []) == lasting
+        check_record(found, config, Objects(env=env), "here")
+        with pytest.raises(ValueError, match="pass it again as env="):
+            check_record(found, config, Objects(), "here")
+        if not lasting:
+            other = Objects(env=OwnEnv(config.env, make_local()))
+            with pytest.raises(ValueError, match=r"reward=.*, which only the process"):
+                check_record(found, config, other, "here")
+
+
+class OwnEnv:
+    def __init__(self, config, reward):
+        self.config, self.reward = config, reward
+
+
+@pytest.mark.parametrize("command", ["train", "sweep"])
+def test_a_command_line_does_not_start_from_a_configuration_without_its_objects(
+    command, own, tmp_path, capsys
+):
+    config = train_config(reward="own_parts:reward", total_steps=1_000)
+    run = SavedRun(
+        config,
+        record(config, Objects(reward=own.reward, network=own.Net())),
+        load_scene("arm_cube").source,
+    )
+    save_run(tmp_path, run)
+    file = str(tmp_path / "config.json")
+    for given, missing in (
+        ([], "network=own_parts:Net"),
+        (["--reward", "own_parts:other"], "network=own_parts:Net"),
+        (["--network=own_parts:Net"], "reward=own_parts:reward"),
+    ):
+        assert main([command, "--config", file, *given]) == 2
+        error = capsys.readouterr().err
+        name = missing.split("=")[0]
+        assert error == (
+            f"error: {file} is of a run that was passed {missing} from Python, which the file does "
+            f"not hold: give --{name} MODULE:NAME\n"
+        )
+    told = ["--reward", "own_parts:other", "--network", "own_parts:Net"]
+    parsed, _ = parse([command, "--config", file, *told])
+    assert parsed.options.total_steps == 1_000
+    assert parsed.options.env.reward == "own_parts:other"
+    assert parsed.options.network.network == "own_parts:Net"
+
+
+def test_what_a_command_line_cannot_name_is_refused(tmp_path, capsys):
+    config = train_config()
+    objects = Objects(env=OwnEnv(config.env, None))
+    save_run(tmp_path, SavedRun(config, record(config, objects), load_scene("arm_cube").source))
+    assert main(["train", "--config", str(tmp_path / "config.json")]) == 2
+    assert "was passed env=test_objects:OwnEnv from Python" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("values", [5, ["reward"], {"reward": "own"}, {"reward": {"given": 3}}])
+def test_a_record_that_is_none_is_refused(values):
+    with pytest.raises(ValueError, match=r"some\.json: 'objects' must be the record of a run, got"):
+        parse_record(values, "some.json")
 
 
 def make_local():

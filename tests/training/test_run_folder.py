@@ -212,6 +212,16 @@ def test_a_folder_has_one_process_at_a_time(copy, capsys):
         pass
 
 
+@pytest.mark.parametrize("command", ["eval", "play", "export"])
+def test_a_run_of_version_0_1_is_named_as_one(command, tmp_path, capsys):
+    """Its agents have other names, so that it seems to hold none."""
+    (tmp_path / "config.json").write_text('{"env": "B", "physics": "native", "num_envs": 64}')
+    assert main([command, str(tmp_path)]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith(f"error: {tmp_path / 'config.json'} was written by mjx_arm 0.1, ")
+    assert error.count("\n") == 1
+
+
 @pytest.mark.parametrize("damage", ["{", "[1]", '{"env_steps": "x", "wall_s": 1}', "\xff", "{}"])
 def test_a_damaged_line_of_metrics_is_named(damage, copy):
     path = copy / "run/metrics.jsonl"

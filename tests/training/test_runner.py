@@ -136,9 +136,15 @@ def test_an_own_reward_and_network_reach_training(tmp_path):
     # Its terms are scaled as those of any reward.
     assert mean_rewards(folder) == pytest.approx([1.4] * len(mean_rewards(folder)))
     assert len(mean_rewards(folder)) > 0
-    recorded = load_run(folder).objects
-    assert recorded["reward"]["given"].endswith("test_runner:pay_seven")
-    assert set(recorded) == {"reward", "network"}
+    run = load_run(folder)
+    assert run.objects["reward"]["given"].endswith("test_runner:pay_seven")
+    assert set(run.objects) == {"reward", "network"}
+    # Its options name them too, and so does its page.
+    assert run.config.env.reward == run.objects["reward"]["given"]
+    assert run.config.network.network == run.objects["network"]["given"]
+    page = (folder / "report.html").read_text()
+    assert "test_runner:pay_seven" in page
+    assert "completion<" not in page
     with pytest.raises(ValueError, match=r"made with .*: pass it again as network="):
         mjx_arm.load_agent(folder, reward=pay_seven)
     with pytest.raises(ValueError, match=r"pay_seven, got .*pay_eight"):
@@ -203,15 +209,37 @@ def test_own_parts_reach_a_trainer():
         make_trainer(CONFIG, env=env, reward=reward)
 
 
-def test_a_lambda_trains_and_the_run_says_that_it_cannot_be_resumed(tmp_path):
+@pytest.mark.parametrize("inside", [False, True], ids=["as it is", "in an environment"])
+def test_a_lambda_trains_and_the_run_says_that_it_cannot_be_resumed(inside, tmp_path):
     folder = tmp_path / "run"
     reward = lambda before, after, action: {"height": after.measured["height"]}  # noqa: E731
-    results, output = train(folder, reward=reward)
+    parts = {"reward": reward}
+    if inside:
+        options = {"physics": "native", "observation": "state", "max_steps": 15}
+        parts = {"env": mjx_arm.make("A", reward=reward, **options)}
+    results, output = train(folder, **parts)
     assert [result.episodes for result in results] == [2]
     assert "warning: reward is " in output
     assert "which no other process can have: this run cannot be resumed" in output
-    with pytest.raises(ValueError, match=r"was made with reward=.*, which only the process that"):
+    assert load_run(folder).config.env.reward.endswith("<lambda>")
+    made = "reward=.*, which only the process that" if not inside else "env=.*: pass it again"
+    with pytest.raises(ValueError, match=f"was made with {made}"):
         resume(folder, total_steps=800)
+    if inside:
+        parts = {"env": mjx_arm.make("A", reward=lambda *step: reward(*step), **options)}
+        with pytest.raises(ValueError, match=r"was made with reward=.*, which only the process"):
+            resume(folder, total_steps=800, **parts)
+
+
+def test_a_network_with_other_actions_or_none_at_all_is_refused():
+    trainer = make_trainer(CONFIG, network=Own(num_actions=13))
+    with pytest.raises(ValueError, match=r"Q-values of shape \[4, 14\].*, got \[4, 13\]"):
+        trainer.shapes()
+    for network in ("os:path", "json:dumps", "builtins:dict"):
+        with pytest.raises(ValueError, match=f"network '{network}' must be a Flax module"):
+            make_trainer(set_train_options(CONFIG, {"network": network}))
+    with pytest.raises(ValueError, match=r"network '.*test_runner:Own' must be a Flax module, got"):
+        make_trainer(CONFIG, network=Own)
 
 
 def test_on_chunk_sees_metrics_and_state_of_every_chunk(plain, tmp_path):

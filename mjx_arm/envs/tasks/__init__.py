@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from collections.abc import Callable
 from typing import Any
 
@@ -30,6 +31,10 @@ class TaskEntry:
 
 
 _tasks: dict[str, TaskEntry] = {}
+# Are told the name of each task; see `on_register`.
+_listeners: list[Callable[[str], None]] = []
+# A colon would make a name a reference, and gymnasium's ids are made of names.
+_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]*")
 
 
 def register(
@@ -48,12 +53,37 @@ def register(
       scene: name or path of the scene that the task takes by default.
 
     Raises:
-      ValueError: the name is taken by another task.
+      ValueError: the name is taken by another task, or is not made of letters, digits, `_` and `-`;
+        or `make` is no function.
     """
     entry = TaskEntry(make, config, scene)
-    if name in _tasks and _tasks[name] != entry:
-        raise ValueError(f"the task {name!r} is registered already: give another name")
+    if not isinstance(name, str) or not _NAME.fullmatch(name):
+        raise ValueError(
+            f"the name of a task must be a letter, then letters, digits, _ and -, got {name!r}"
+        )
+    if not callable(make):
+        raise ValueError(
+            f"the task {name!r} must be made by a function (config, scene, arm), such as its "
+            f"class, got {make!r}"
+        )
+    if name in _tasks:
+        if _tasks[name] != entry:
+            raise ValueError(f"the task {name!r} is registered already: give another name")
+        return
+    for listener in _listeners:
+        listener(name)
     _tasks[name] = entry
+
+
+def on_register(listener: Callable[[str], None]) -> None:
+    """Calls a function with the name of each task, now and when one is registered.
+
+    Args:
+      listener: may raise ValueError, and the task is not registered.
+    """
+    for name in _tasks:
+        listener(name)
+    _listeners.append(listener)
 
 
 def find_task(name: str) -> TaskEntry:
@@ -78,4 +108,12 @@ register("lift", Lift, config=LiftConfig)
 register("reach", Reach, config=ReachConfig, scene="arm_reach")
 register("push", Push, config=PushConfig, scene="arm_push")
 
-__all__: list[Any] = ["Task", "TaskConfig", "TaskEntry", "find_task", "register", "task_names"]
+__all__: list[Any] = [
+    "Task",
+    "TaskConfig",
+    "TaskEntry",
+    "find_task",
+    "on_register",
+    "register",
+    "task_names",
+]

@@ -8,7 +8,6 @@ from typing import Protocol
 import jax
 import numpy as np
 
-from mjx_arm.envs.arm import Arm
 from mjx_arm.envs.collision import Obstacle
 from mjx_arm.envs.state import EnvState, Placement, Snapshot
 from mjx_arm.kinematics import Poses
@@ -100,9 +99,6 @@ class SizedTask(Task, Protocol):
           params: of the episode.
         """
         ...
-
-
-TaskFactory = Callable[[TaskConfig, Scene, Arm], Task]
 
 
 def rectangle(scene: Scene, name: str) -> tuple[np.ndarray, np.ndarray]:

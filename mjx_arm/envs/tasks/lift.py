@@ -26,6 +26,8 @@ _CUBE = "cube"
 _SQUEEZE = 0.0005
 # A pad presses where it is inside the cube, contacts being soft; this much is rounding.
 _TOUCH = 1e-5
+# How far a pad may be from where its finger's joint says, m.
+_PAD_OFF = 1e-3
 
 
 @options
@@ -71,7 +73,8 @@ class Lift:
     """Grasp the cube and lift it.
 
     The scene needs a cube: a box `cube` of equal edges on a free joint `cube`, which lies on the
-    ground in the keyframe `home`; spheres `left_pad_0`, ... and `right_pad_0`, ... on the fingers;
+    ground in the keyframe `home`; fingers on slides whose position is the distance of their pads
+    from the grasp site; the pads, spheres `left_pad_0`, ... and `right_pad_0`, ... on the fingers;
     and a numeric `cube_rectangle`: centre x, y and half extents x, y of the cube's places, m.
 
     It measures `grasped` and `success` (bool), `height` of the cube above its rest and `distance`
@@ -89,6 +92,7 @@ class Lift:
         self.cube_qpos = int(model.jnt_qposadr[scene.find("joint", _CUBE)])
         self.pad_geoms = _find_pads(scene)
         self.half_size = _check_cube(scene, self.cube_geom, arm)
+        _check_fingers(scene, arm, self.pad_geoms)
         # The same, or where it varies by episode that of the episode, m.
         self._half: float | jax.Array = self.half_size
         self._centre, extent = rectangle(scene, "cube_rectangle")
@@ -141,7 +145,7 @@ class Lift:
         qpos = qpos.at[arm.finger_qpos].set(_f32(self._half - _SQUEEZE))
         ctrl = ctrl.at[arm.gripper_ctrl].set(arm.ctrl_range[arm.gripper_ctrl, 0])
         poses = self._kinematics(qpos)
-        # The pads are spheres without a rotation of their own, so theirs is the gripper's.
+        # The pads have no rotation of their own, so theirs is the finger's; see `_check_fingers`.
         gripper = Rotation.from_matrix(poses.geom_xmat[self.pad_geoms[0, 0]])
         pose = [poses.site_xpos[arm.grasp_site], gripper.as_quat(scalar_first=True)]
         return qpos.at[cube].set(jnp.concatenate(pose)), ctrl, {}
@@ -276,6 +280,40 @@ def _find_pads(scene: Scene) -> np.ndarray:
         if model.geom_type[pad] != mujoco.mjtGeom.mjGEOM_SPHERE:
             raise ValueError(f"scene {scene.name!r}: geom {names[pad]!r} must be a sphere")
     return pads
+
+
+def _check_fingers(scene: Scene, arm: Arm, pads: np.ndarray) -> None:
+    """Refuses fingers that do not close on the grasp site by as much as their joints say."""
+    model, name = scene.mj_model, scene.name
+    joints = [int(np.flatnonzero(model.jnt_qposadr == place)[0]) for place in arm.finger_qpos]
+    data = mujoco.MjData(model)
+    data.qpos[:] = arm.home_qpos
+    mujoco.mj_kinematics(model, data)
+    for joint, own in zip(joints, pads.tolist(), strict=True):
+        finger = model.joint(joint).name
+        if model.jnt_type[joint] != mujoco.mjtJoint.mjJNT_SLIDE:
+            raise ValueError(
+                f"scene {name!r}: joint {finger!r} must be a slide, whose position is how far its "
+                "pads are from the site 'grasp', m"
+            )
+        if np.abs(model.jnt_axis[joint]).max() < 1 - 1e-6:
+            raise ValueError(
+                f"scene {name!r}: joint {finger!r} must slide along x, y or z of its body"
+            )
+        for pad in own:
+            geom = f"scene {name!r}: geom {model.geom(pad).name!r}"
+            if model.geom_bodyid[pad] != model.jnt_bodyid[joint]:
+                raise ValueError(f"{geom} must be on the body of joint {finger!r}")
+            if abs(model.geom_quat[pad][0]) < 1 - 1e-9:
+                raise ValueError(f"{geom} must have no rotation of its own")
+            offset = data.geom_xpos[pad] - data.site_xpos[arm.grasp_site]
+            inner = offset @ data.xaxis[joint] - model.geom_size[pad, 0]
+            position = arm.home_qpos[model.jnt_qposadr[joint]]
+            if abs(inner - position) > _PAD_OFF:
+                raise ValueError(
+                    f"{geom} must be as far from the site 'grasp' as joint {finger!r} says: at "
+                    f"home {position:.4f} m along its axis, got {inner:.4f} m"
+                )
 
 
 def _check_cube(scene: Scene, geom: int, arm: Arm) -> float:

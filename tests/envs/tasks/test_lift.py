@@ -10,9 +10,10 @@ import pytest
 from rollouts import make_pushing_policy, make_random_policy, rollout
 
 import mjx_arm
+from mjx_arm.envs.arm import resolve_arm
 from mjx_arm.envs.scripted import make_scripted_policy
 from mjx_arm.envs.state import Snapshot
-from mjx_arm.envs.tasks.lift import LiftConfig, completion_reward, grasped, paper_reward
+from mjx_arm.envs.tasks.lift import Lift, LiftConfig, completion_reward, grasped, paper_reward
 from mjx_arm.kinematics import make_kinematics
 
 GAMMA = 0.99
@@ -192,6 +193,75 @@ def test_a_scene_without_what_the_task_needs_is_refused_by_name(tmp_path, old, n
     path.write_text(text.replace(old, new))
     with pytest.raises(ValueError, match=message):
         mjx_arm.make("A", scene=str(path))
+
+
+LEFT_PAD = '<geom name="left_pad_0" class="pad" pos="0.112 0.008 0.007"/>'
+GRASP = '<site name="grasp" pos="0.1072 0 0" size="0.004" group="3"/>'
+FREE, ON_A_SLIDE = '<freejoint name="cube"/>', '<joint name="cube" type="slide" axis="1 0 0"/>'
+PLACE = " 0.36 0 0.025 1 0 0 0"
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (
+            {'<joint name="left_finger"': '<joint name="left_finger" type="hinge"'},
+            "joint 'left_finger' must be a slide",
+        ),
+        (
+            {'"right_finger" axis="0 -1 0"': '"right_finger" axis="0 -1 1"'},
+            "joint 'right_finger' must slide along x, y or z of its body",
+        ),
+        (
+            {LEFT_PAD: "", GRASP: GRASP + LEFT_PAD},
+            "'left_pad_0' must be on the body of joint 'left",
+        ),
+        (
+            {LEFT_PAD: LEFT_PAD.replace("/>", ' euler="0 0 30"/>')},
+            "geom 'left_pad_0' must have no rotation of its own",
+        ),
+        (
+            {LEFT_PAD: LEFT_PAD.replace("0.008", "0.012")},
+            "'left_pad_0' must be as far from the site 'grasp' as .* 0.0580 m .*, got 0.0620 m",
+        ),
+        (
+            {'<joint name="left_finger" axis="0 1 0"': '<joint name="left_finger" axis="0 -1 0"'},
+            "'left_pad_0' must be as far from the site 'grasp' as joint 'left_finger' says",
+        ),
+        ({FREE: ON_A_SLIDE, PLACE: " 0"}, "joint 'cube' must be a free joint"),
+    ],
+)
+def test_fingers_and_joints_that_the_task_cannot_use_are_refused_by_name(
+    tmp_path, changes, message
+):
+    text = SCENE.read_text()
+    for old, new in changes.items():
+        assert text.count(old) == 1
+        text = text.replace(old, new)
+    path = tmp_path / "scene.xml"
+    path.write_text(text)
+    with pytest.raises(ValueError, match=message) as raised:
+        mjx_arm.make("A", scene=str(path))
+    assert "\n" not in str(raised.value)
+
+
+def test_a_second_free_body_before_the_cube_stays_where_the_keyframe_has_it(tmp_path):
+    """The scene's first body, so that its joint comes first in every array."""
+    ball = '<body name="ball" pos="0 0.5 0.02"><freejoint/><geom size="0.02" mass="0.1"/></body>'
+    text = SCENE.read_text().replace('<body name="base">', ball + '<body name="base">')
+    path = tmp_path / "scene.xml"
+    path.write_text(text.replace('qpos="0 0.0402', 'qpos="0 0.5 0.02 1 0 0 0 0 0.0402'))
+    scene, plain = mjx_arm.load_scene(path), mjx_arm.load_scene("arm_cube")
+    arm, place = resolve_arm(scene), jnp.asarray([0.33, -0.07], jnp.float32)
+    task = Lift(LiftConfig(), scene, arm)
+    qpos, _, _ = task.start(jnp.asarray(arm.home_qpos), jnp.asarray(arm.home_ctrl), place)
+    np.testing.assert_allclose(qpos[:7], [0, 0.5, 0.02, 1, 0, 0, 0], atol=1e-6)
+    np.testing.assert_array_equal(qpos[arm.qpos], resolve_arm(plain).home_qpos[:6])
+    data = mujoco.MjData(scene.mj_model)
+    data.qpos[:] = qpos
+    mujoco.mj_kinematics(scene.mj_model, data)
+    cube = data.geom_xpos[task.cube_geom]
+    np.testing.assert_allclose(cube, [*place, task.half_size], atol=1e-6)
 
 
 @pytest.mark.parametrize(
