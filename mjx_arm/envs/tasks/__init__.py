@@ -57,7 +57,7 @@ def register(
         or `make` is no function.
     """
     entry = TaskEntry(make, config, scene)
-    if not isinstance(name, str) or not _NAME.fullmatch(name):
+    if not _NAME.fullmatch(str(name)):
         raise ValueError(
             f"the name of a task must be a letter, then letters, digits, _ and -, got {name!r}"
         )
