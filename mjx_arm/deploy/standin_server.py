@@ -187,7 +187,7 @@ def invalid_command(command: dict[str, Any], hello: dict[str, Any]) -> str:
         joint, degrees, step = command.get("joint"), command.get("degrees"), hello["step"]
         if type(joint) is not int or not 0 <= joint < len(hello["joints"]):
             return f"a command names the joint {joint!r}"
-        if type(degrees) not in (int, float) or abs(degrees) != step:
+        if type(degrees) not in (int, float) or degrees not in (-step, step):
             return f"a command moves a joint by {degrees!r} degrees instead of {step:g}"
         return ""
     if kind == "reset":

@@ -68,7 +68,7 @@ def _colours(model: mujoco.MjModel, ranges: Ranges) -> Part | None:
 
     def make(uniform: jax.Array, growth: Growth) -> Params:
         uniform = uniform.reshape(-1, 4)
-        colour = own[:, :3] + growth * jitter * (2 * uniform[:, :3] - 1)
+        colour = jnp.asarray(own[:, :3]) + growth * jitter * (2 * uniform[:, :3] - 1)
         if red is not None:
             share = between(uniform[:, 3], *red, own[:, 0], growth)
             colour = colour.at[:, 0].set(jnp.where(reddens, share, colour[:, 0]))
