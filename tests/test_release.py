@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import email
+import os
 import re
 import subprocess
 import sys
@@ -36,8 +37,15 @@ print(mjx_arm.__file__, state.physics.qpos.shape)
 
 
 def run(command: list[object], cwd: Path | None = None) -> str:
+    # PYTHONPATH would put the repository before what is installed.
+    environment = {name: x for name, x in os.environ.items() if name != "PYTHONPATH"}
     result = subprocess.run(
-        list(map(str, command)), cwd=cwd, capture_output=True, text=True, check=False
+        list(map(str, command)),
+        cwd=cwd,
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
     )
     assert result.returncode == 0, result.stdout + result.stderr
     return result.stdout
