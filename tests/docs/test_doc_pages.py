@@ -55,7 +55,7 @@ def test_every_language_of_the_pages_is_tested():
         for each in snippets(path.read_text(), path.name):
             where = f"{path.name}, line {each.line}"
             assert each.language in ("python", "sh", "json", "text"), where
-            assert each.mark in ("", "slow", "peers", "check"), where
+            assert each.mark in ("", "slow", "peers", "check", "devices"), where
 
 
 def test_every_agent_has_its_card_on_the_page():
