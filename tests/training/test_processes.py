@@ -94,23 +94,16 @@ def train(*arguments: str) -> list[subprocess.Popen]:
     return start("-m", "mjx_arm", "train", *arguments)
 
 
-def wait_for_checkpoint(folder: pathlib.Path, started: list[subprocess.Popen]) -> None:
+def wait_for_checkpoint(
+    folder: pathlib.Path, started: list[subprocess.Popen], after: int = 0
+) -> None:
+    """Waits for a checkpoint of a later vector step."""
     deadline = time.monotonic() + 600
-    while RunCheckpoints(folder).newest() is None:
+    while max(RunCheckpoints(folder).steps(), default=0) <= after:
         assert time.monotonic() < deadline
         ended = [process.communicate() for process in started if process.poll() is not None]
         assert not ended, ended
         time.sleep(0.1)
-
-
-def resume_with_two(folder: pathlib.Path) -> None:
-    """Two chunks more by two processes, from the newest checkpoint on."""
-    done = RunCheckpoints(folder).steps()[-1] * 8
-    arguments = ["--total-steps", str(done + 320), "--eval-episodes", "4"]
-    ended = finish(train("--resume", str(folder), *arguments))
-    assert [status for status, *_ in ended] == [0, 0], ended
-    assert f"resuming after {done:,} steps" in ended[0][1]
-    assert [row["env_steps"] for row in read_metrics(folder)] == list(range(160, done + 321, 160))
 
 
 def final_state(folder: pathlib.Path) -> list[np.ndarray]:
@@ -321,7 +314,12 @@ def test_a_signal_to_one_of_two_processes_stops_both_and_two_resume(tmp_path, ca
     ended = finish(started)
     assert [status for status, *_ in ended] == [130, 130], ended
     assert "saved; continue with" in ended[0][2]
-    resume_with_two(folder)
+    done = RunCheckpoints(folder).steps()[-1] * 8
+    arguments = ["--total-steps", str(done + 320), "--eval-episodes", "4"]
+    ended = finish(train("--resume", str(folder), *arguments))
+    assert [status for status, *_ in ended] == [0, 0], ended
+    assert f"resuming after {done:,} steps" in ended[0][1]
+    assert [row["env_steps"] for row in read_metrics(folder)] == list(range(160, done + 321, 160))
 
 
 @pytest.mark.slow
@@ -334,8 +332,17 @@ def test_two_killed_processes_are_resumed_by_two(tmp_path):
         process.kill()
     ended = finish(started)
     assert [status for status, *_ in ended] == [-signal.SIGKILL] * 2, ended
-    resume_with_two(folder)
+    done = RunCheckpoints(folder).steps()[-1]
+    # Stopped again: an evaluation at the end would compile for longer than all of this.
+    resumed = train("--resume", str(folder))
+    wait_for_checkpoint(folder, resumed, after=done)
+    resumed[0].send_signal(signal.SIGTERM)
+    ended = finish(resumed)
+    assert [status for status, *_ in ended] == [130, 130], ended
+    assert f"resuming after {8 * done:,} steps" in ended[0][1]
     rows = read_metrics(folder)
+    last = RunCheckpoints(folder).steps()[-1] * 8
+    assert [row["env_steps"] for row in rows] == list(range(160, last + 1, 160))
     assert rows[0]["student_updates"] == 0
     assert all(row["student_updates"] == 60 for row in rows[1:])
     assert all(math.isfinite(row["student_loss"]) for row in rows[1:])
