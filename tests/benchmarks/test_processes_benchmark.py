@@ -55,7 +55,7 @@ def test_all_variants_train_the_same():
     assert config.algo.student_batch_size % 2 == 0
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.skipif(usable_cores() < 2, reason="needs two cores")
 def test_every_variant_is_rehearsed(tmp_path: pathlib.Path):
     file = tmp_path / "processes.json"

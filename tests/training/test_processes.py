@@ -348,8 +348,9 @@ def test_two_killed_processes_are_resumed_by_two(tmp_path):
     assert all(math.isfinite(row["student_loss"]) for row in rows[1:])
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("lost", [0, 1])
+@pytest.mark.parametrize(
+    "lost", [pytest.param(0, marks=pytest.mark.long), pytest.param(1, marks=pytest.mark.slow)]
+)
 def test_when_a_process_is_lost_the_others_end_and_the_run_resumes_with_one(lost, tmp_path):
     folder = tmp_path / "run"
     started = train(*OPTIONS, *LONG, "--out", str(folder))
