@@ -21,6 +21,7 @@ import functools
 import importlib.util
 import json
 import pathlib
+import subprocess
 import time
 import zlib
 from collections.abc import Callable, Iterator
@@ -34,10 +35,12 @@ from throughput import compile_training, env_stages, peak_memory, time_stage, ti
 import mjx_arm
 from mjx_arm.config import TrainConfig, set_train_options
 from mjx_arm.physics import compiler_options
+from mjx_arm.report.machine import versions
 from mjx_arm.training.evaluate import make_evaluator
 from mjx_arm.training.loop import SELECTION, make_trainer, role_key
 
-STORED = pathlib.Path(__file__).parent / "results" / "gpu-parity.json"
+ROOT = pathlib.Path(__file__).parents[1]
+STORED = ROOT / "benchmarks" / "results" / "gpu-parity.json"
 # Of the evaluations that say how far a training is; `train` selects by the same.
 _SEED, _EPSILON = 2_000_003, 0.1
 # Poses whose images are compared, and iterations of the motion that is.
@@ -109,34 +112,73 @@ def device(visit: Visit, write: Write) -> None:
     """Versions and device."""
     del visit
     one = jax.devices()[0]
-    write({"devices": jax.device_count(), "memory": one.memory_stats() or {}})
+    query = ["nvidia-smi", "--query-gpu=driver_version", "--format=csv,noheader"]
+    # Never a tag, which would not name the commit.
+    describe = ["git", "-C", str(ROOT), "describe", "--always", "--dirty", "--exclude=*"]
+    write(
+        {
+            "devices": jax.device_count(),
+            "memory": one.memory_stats() or {},
+            "versions": versions("chex", "warp-lang", "jax-cuda12-plugin", "jax-cuda13-plugin"),
+            "driver": first_line(query),
+            "commit": first_line(describe),
+        }
+    )
+
+
+def first_line(command: list[str]) -> str | None:
+    """The first line that a command prints; None where it is missing, fails or prints nothing."""
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=30)
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return next(iter(done.stdout.splitlines()), None)
 
 
 def parity(visit: Visit, write: Write) -> None:
     """Renderer and physics here beside the stored values of the CPU."""
-    stored, now = json.loads(STORED.read_text()), compute(visit)
+    del visit
+    write(compare(json.loads(STORED.read_text()), compute()))
+
+
+def compare(stored: Row, now: Row) -> Row:
+    """How far a result of `compute` is from the stored ones.
+
+    The physics is compared with that of each stored backend: with the same one, which says what
+    the device changes, and with the others.
+    """
     images, expected = _decode(now["images"]), _decode(stored["images"])
     same = np.asarray(mjx_arm.segmentation(images)) == np.asarray(mjx_arm.segmentation(expected))
     colours = np.abs(np.asarray(mjx_arm.rgb(images), int) - np.asarray(mjx_arm.rgb(expected), int))[
         same
     ]
-    gap = np.abs(np.asarray(now["qpos"]) - np.asarray(stored["qpos"])).max(axis=(1, 2))
-    write(
-        {
-            "stored_on": stored["machine"],
-            "share_of_pixels_of_another_geom": float(1 - same.mean()),
-            "largest_difference_of_colour": int(colours.max(initial=0)),
-            "backends": [stored["backend"], now["backend"]],
-            "largest_difference_of_qpos": float(gap.max()),
-            "by_iteration": gap.tolist(),
-        }
-    )
+    gaps = {
+        backend: np.abs(np.asarray(now["qpos"]) - np.asarray(qpos)).max(axis=(1, 2))
+        for backend, qpos in stored["qpos"].items()
+    }
+    return {
+        "stored_on": stored["machine"],
+        "share_of_pixels_of_another_geom": float(1 - same.mean()),
+        "largest_difference_of_colour": int(colours.max(initial=0)),
+        "backend": now["backend"],
+        "largest_difference_of_qpos": {name: float(gap.max()) for name, gap in gaps.items()},
+        "by_iteration": {name: gap.tolist() for name, gap in gaps.items()},
+    }
 
 
-def compute(visit: Visit) -> Row:
+def store() -> Row:
+    """What `compare` needs from a CPU: images, and the motion with both backends that run there."""
+    native, mjx = compute("native"), compute("mjx")
+    return {
+        "machine": machine(),
+        "images": native["images"],
+        "qpos": {"native": native["qpos"], "mjx": mjx["qpos"]},
+    }
+
+
+def compute(physics: str = "auto") -> Row:
     """Images of some starts in B, and a motion of the arm through the air from the same starts."""
-    del visit
-    env = mjx_arm.make("B", observation="packed", physics="auto")
+    env = mjx_arm.make("B", observation="packed", physics=physics)
     keys = jax.random.split(jax.random.key(11), _POSES)
     flags = compiler_options(env.physics)
     obs, state = jax.jit(jax.vmap(env.reset), compiler_options=flags)(keys)
@@ -267,6 +309,15 @@ def training(
     write(row | peak_memory(compiled))
 
 
+def _with_own_ratio(num_envs: int) -> dict[str, int]:
+    """Batches with which each environment step has as many samples as in the preset `gpu`."""
+    preset = mjx_arm.PRESETS["gpu"]
+    return {
+        name: getattr(preset.algo, name) * num_envs // preset.num_envs
+        for name in ("teacher_batch_size", "student_batch_size")
+    }
+
+
 def _cells() -> dict[str, list[Cell]]:
     """The cells of each command, in their order."""
     part = functools.partial
@@ -275,7 +326,8 @@ def _cells() -> dict[str, list[Cell]]:
         Cell("parity", "parity", parity, 20),
         Cell("a", "train-a", part(train, env="A", goal=0.95, minutes=4.0), 120),
     ]
-    for num_envs in (8_192, 1_024):
+    many = 8_192
+    for num_envs in (many, 1_024):
         first += [
             Cell(
                 f"physics+render at {num_envs}",
@@ -285,7 +337,10 @@ def _cells() -> dict[str, list[Cell]]:
             ),
             Cell(f"training at {num_envs}", "throughput", part(training, num_envs=num_envs), 90),
         ]
-    many = 8_192
+        if num_envs == many:
+            measure = part(training, num_envs=many, **_with_own_ratio(many))
+            name = f"training at {many} with the preset's samples a step"
+            first.append(Cell(name, "throughput", measure, 90))
     for convolution in ("nn.Conv", "patches"):
         measure = part(training, num_envs=many, convolution=convolution)
         first.append(Cell(f"convolution {convolution}", "comparisons", measure, 90))
@@ -373,7 +428,7 @@ def main(arguments: list[str] | None = None) -> None:
     if options.store:
         if jax.default_backend() != "cpu":
             parser.error("--store keeps the values of a CPU: set JAX_PLATFORMS=cpu")
-        STORED.write_text(json.dumps({"machine": machine(), **compute(visit)}) + "\n")
+        STORED.write_text(json.dumps(store()) + "\n")
         return
     if options.json is None:
         parser.error("--json must be a folder for the results, got none")

@@ -12,14 +12,19 @@ them and checks their digests. Wheels of more than 40 MiB are cut into parts.
 from __future__ import annotations
 
 import argparse
+import importlib.metadata
 import json
 import pathlib
 import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterable
+import tomllib
+from collections.abc import Callable, Iterable
 from typing import Any
+
+# The machine may have no `packaging`; pip, without which nothing is installed, brings its own.
+from pip._vendor.packaging.requirements import Requirement
 
 # What training and `gpu.py` import beyond the image.
 NEEDED = (
@@ -40,6 +45,9 @@ LEFT_OUT = frozenset(
         *("tensorboardx",),
     }
 )
+# What the image has and training imports; `install` compares the versions.
+OF_IMAGE = ("jax", "flax", "optax", "chex")
+PYPROJECT = pathlib.Path(__file__).parents[1] / "pyproject.toml"
 PART = 40 * 2**20
 LIST = "wheels.json"
 
@@ -129,14 +137,46 @@ def fetch(folder: pathlib.Path, python: str, jax: str, *, warp: bool) -> dict[st
 
 
 def install(folder: pathlib.Path) -> int:
-    """Installs the wheels of a folder with this Python; returns pip's exit status."""
+    """Installs the wheels of a folder with this Python; returns pip's exit status.
+
+    Prints a warning for each package of the image whose version `pyproject.toml` does not allow.
+    """
     with tempfile.TemporaryDirectory() as whole:
         wheels = join(folder, pathlib.Path(whole))
         if not wheels:
             print(f"error: {folder} holds no wheels: fetch them first", file=sys.stderr)
             return 2
         command = [sys.executable, "-m", "pip", "install", "--no-index", "--no-deps"]
-        return subprocess.run([*command, *map(str, wheels)], check=False).returncode
+        status = subprocess.run([*command, *map(str, wheels)], check=False).returncode
+    for sentence in mismatches():
+        print(f"warning: {sentence}", file=sys.stderr)
+    return status
+
+
+def mismatches(
+    pyproject: pathlib.Path = PYPROJECT,
+    installed: Callable[[str], str] = importlib.metadata.version,
+) -> list[str]:
+    """A sentence for each package of the image that `pyproject.toml` does not allow.
+
+    Args:
+      pyproject: the file.
+      installed: the version of a package; raises `PackageNotFoundError` where it is missing.
+    """
+    listed = tomllib.loads(pyproject.read_text(encoding="utf-8"))["project"]["dependencies"]
+    found = []
+    for requirement in map(Requirement, listed):
+        if requirement.name not in OF_IMAGE:
+            continue
+        wanted = f"pyproject.toml asks for {requirement}"
+        try:
+            version = installed(requirement.name)
+        except importlib.metadata.PackageNotFoundError:
+            found.append(f"{requirement.name} is not installed, and {wanted}")
+            continue
+        if not requirement.specifier.contains(version, prereleases=True):
+            found.append(f"{requirement.name} {version} is installed, and {wanted}")
+    return found
 
 
 def main() -> int:

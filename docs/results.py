@@ -27,11 +27,27 @@ def render(name: str, folder: pathlib.Path = RESULTS) -> str:
     if name not in TABLES:
         raise ValueError(f"results must name one of {', '.join(TABLES)}, got {name!r}")
     file, make = TABLES[name]
-    content = json.loads((folder / file).read_text(encoding="utf-8"))
+    content = _read(folder / file)
     header, rows = make(content)
     lines = [header, ["---"] * len(header), *rows]
     table = "\n".join(f"| {' | '.join(str(x) for x in line)} |" for line in lines)
-    return f"{table}\n\n{_machine(content)} File: `benchmarks/results/{file}`."
+    kind = "Files" if file in FOLDERS else "File"
+    return f"{table}\n\n{_machine(content)}{kind}: `benchmarks/results/{file}`."
+
+
+def _read(path: pathlib.Path) -> Any:
+    """The content of a file, or of each file of a folder by its stem.
+
+    A folder, and what is not measured yet, may be missing, and is empty then.
+
+    Raises:
+      FileNotFoundError: another file is missing.
+    """
+    if path.name in FOLDERS:
+        return {each.stem: _read(each) for each in sorted(path.glob("*.json"))}
+    if path.name in NOT_YET and not path.is_file():
+        return {}
+    return json.loads(path.read_text(encoding="utf-8"))
 
 
 Table = tuple[list[str], list[list[str]]]
@@ -199,6 +215,68 @@ def _desk(content: Any) -> Table:
     return ["variant", "images, of plain", "images/s", "steps, of plain", "steps/s"], rows
 
 
+def _gpu(content: Any) -> Table:
+    rows = [
+        _to_success(content, "train-a", 0.95, "environment A to 95 %", 3),
+        _to_success(content, "train-b", 0.90, "environment B to 90 %", 5),
+        _rate(content, "physics+render at 8192", "physics and rendering", 400_000),
+        _rate(content, "training at 8192 with the preset's samples a step", "training", 100_000),
+    ]
+    return ["what", "goal", "measured", "device"], rows
+
+
+def _to_success(content: Any, file: str, goal: float, what: str, minutes: int) -> list[str]:
+    """A row of the trainings of a file: when each first reached a rate of success."""
+    rows = _measured(content, file)
+    said = []
+    for row in rows:
+        reached = [each for each in row["judged"] if each["rate"] >= goal]
+        if reached:
+            said.append(f"{reached[0]['minutes']:.1f} minutes")
+        elif row["judged"]:
+            best = max(each["rate"] for each in row["judged"])
+            said.append(f"{100 * best:.0f} % in {row['judged'][-1]['minutes']:.1f} minutes")
+    return [what, f"{minutes} minutes", *_cells_of(said, rows)]
+
+
+def _rate(content: Any, cell: str, what: str, goal: int) -> list[str]:
+    """A row of the figures of a cell at 8,192 environments."""
+    rows = [
+        row
+        for row in _measured(content, "throughput")
+        if row["cell"] == cell and "steps_per_s" in row
+    ]
+    said = [f"{_number(row['steps_per_s'])} steps/s" for row in rows]
+    return [f"{what} of 8,192 environments", f"{goal:,} steps/s", *_cells_of(said, rows)]
+
+
+def _measured(content: Any, file: str) -> list[Any]:
+    """The rows of a file of `gpu.py` without those that failed."""
+    return [row for row in content.get(file, {"rows": []})["rows"] if "failed" not in row]
+
+
+def _cells_of(said: list[str], rows: list[Any]) -> list[str]:
+    """All figures of a row, none left out, and the devices that they were taken on."""
+    if not said:
+        return ["not measured", "not measured"]
+    return [", ".join(said), ", ".join(sorted({row["machine"]["device"] for row in rows}))]
+
+
+def _processes(content: Any) -> Table:
+    measured = {row["variant"]: row for row in content.get("rows", [])}
+    rows = []
+    for variant in ("1 process, 1 core", "1 process, 2 cores", "2 processes, a core each"):
+        if variant not in measured:
+            rows.append([variant, *["not measured"] * 3])
+            continue
+        row = measured[variant]
+        span = f"{_number(row['least'])} to {_number(row['most'])}"
+        exchange = row["exchange"]
+        share = "nothing to exchange" if exchange is None else f"{100 * exchange:.0f} %"
+        rows.append([variant, _number(row["steps_per_s"]), span, share])
+    return ["what", "steps/s, median", "all rounds", "share of the time for the exchange"], rows
+
+
 def _sizes(content: Any) -> list[int]:
     return sorted({row["num_envs"] for row in content["rows"]})
 
@@ -211,7 +289,7 @@ def _machine(content: Any) -> str:
     machine = content.get("machine")
     if machine is None:
         return ""
-    return f"Machine: {machine['cpu']}, {machine['cores']} cores, {_versions(machine)}."
+    return f"Machine: {machine['cpu']}, {machine['cores']} cores, {_versions(machine)}. "
 
 
 def _versions(machine: Any) -> str:
@@ -235,7 +313,13 @@ TABLES: dict[str, tuple[str, Callable[[Any], Table]]] = {
     "smoke": ("smoke.json", _seconds),
     "time-to-success": ("time_to_success_2_cores.json", _time_to_success),
     "time-to-success-1": ("time_to_success.json", _time_to_success),
+    "gpu": ("gpu", _gpu),
+    "processes": ("processes.json", _processes),
 }
+# What `benchmarks/gpu.py` wrote. Git keeps no empty folder, so a missing one is an empty one.
+FOLDERS = ("gpu",)
+# Figures that nobody could take yet; their tables say so.
+NOT_YET = ("processes.json",)
 
 
 def setup(app: Any) -> dict[str, bool]:

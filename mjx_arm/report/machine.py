@@ -14,6 +14,8 @@ import mujoco
 
 from mjx_arm.cores import usable_cores
 
+_PACKAGES = ("mjx-arm", "jax", "jaxlib", "mujoco", "mujoco-mjx", "flax", "optax", "numpy")
+
 
 def machine() -> dict[str, Any]:
     """Processor, device and versions."""
@@ -35,7 +37,17 @@ def machine() -> dict[str, Any]:
     }
 
 
-def versions() -> dict[str, str]:
-    """Versions of the packages that figures depend on."""
-    names = ("mjx-arm", "jax", "jaxlib", "mujoco", "mujoco-mjx", "flax", "optax", "numpy")
-    return {name: importlib.metadata.version(name) for name in names}
+def versions(*more: str) -> dict[str, str | None]:
+    """Versions of the packages that figures depend on; None for one that is not installed.
+
+    Args:
+      *more: names of further packages.
+    """
+    return {name: _version(name) for name in (*_PACKAGES, *more)}
+
+
+def _version(name: str) -> str | None:
+    try:
+        return importlib.metadata.version(name)
+    except importlib.metadata.PackageNotFoundError:
+        return None

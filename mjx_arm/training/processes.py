@@ -6,9 +6,9 @@ With one process each function does without the others.
 
 from __future__ import annotations
 
-import importlib.util
 import itertools
 import os
+import pathlib
 import sys
 import threading
 import time
@@ -29,6 +29,8 @@ _START, _END = 300, 30
 _PATIENCE = 24 * 60 * 60 * 1000
 # Bytes of a text that process 0 tells the others.
 _TEXT = 65_536
+# Where a pod finds its namespace.
+_NAMESPACE = pathlib.Path("/var/run/secrets/kubernetes.io/serviceaccount/namespace")
 _barriers = itertools.count()
 _ending = threading.Event()
 
@@ -88,9 +90,27 @@ def detects_processes(environ: Mapping[str, str]) -> bool:
         return int(tasks) > 1
     if "OMPI_MCA_orte_hnp_uri" in environ:
         return int(environ.get("OMPI_COMM_WORLD_SIZE", "1")) > 1
-    # Only Kubernetes itself knows how many pods a job has; jax asks it through this package.
     indexed = {"KUBERNETES_SERVICE_HOST", "JOB_COMPLETION_INDEX"} <= set(environ)
-    return indexed and importlib.util.find_spec("kubernetes") is not None
+    return indexed and _pods_at_once(environ) != 1
+
+
+def _pods_at_once(environ: Mapping[str, str]) -> int | None:
+    """Pods of an indexed job that run at the same time; None where Kubernetes does not say."""
+    try:
+        # Only Kubernetes itself knows this; jax asks it through the same package.
+        from kubernetes import client, config
+    except ImportError:
+        return 1
+    # The host name of a pod is that of its job, with its index.
+    name = environ.get("HOSTNAME", "").removesuffix(f"-{environ['JOB_COMPLETION_INDEX']}")
+    try:
+        config.load_incluster_config()
+        namespace = _NAMESPACE.read_text(encoding="utf-8").strip()
+        spec = client.BatchV1Api().read_namespaced_job(name, namespace).spec
+    except Exception:
+        # Whatever is wrong, jax meets it next, and its error is shown.
+        return None
+    return min(int(spec.parallelism), int(spec.completions))
 
 
 def _initialize(**options: Any) -> None:

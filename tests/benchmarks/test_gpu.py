@@ -2,14 +2,23 @@
 
 from __future__ import annotations
 
+import base64
+import importlib.metadata
 import json
 import os
 import pathlib
 import subprocess
 import sys
 import textwrap
+import zlib
 
+import jax
+import numpy as np
 import pytest
+
+import mjx_arm
+from mjx_arm.config import set_train_options
+from mjx_arm.report.machine import versions
 
 sys.path.insert(0, str(pathlib.Path(__file__).parents[2] / "benchmarks"))
 import gpu
@@ -45,25 +54,93 @@ def test_a_cell_for_which_no_time_is_left_is_left_out(tmp_path, capsys):
     assert capsys.readouterr().out.count("left out") == len(gpu.CELLS[""])
 
 
-def test_it_does_without_what_a_bare_machine_lacks():
-    """Nor matplotlib, which throughput.py needs for its plot alone."""
-    code = """
-        import sys
-        absent = "orbax imageio_ffmpeg imageio tensorboardX gymnasium matplotlib".split()
-        sys.modules |= dict.fromkeys(absent)
-        sys.path.insert(0, "benchmarks")
-        import gpu
-        print(len(gpu.CELLS))
-    """
+# Without these, and without matplotlib, which throughput.py needs for its plot alone.
+BARE = """
+    import sys
+    absent = "orbax imageio_ffmpeg imageio tensorboardX gymnasium matplotlib".split()
+    sys.modules |= dict.fromkeys(absent)
+    sys.path.insert(0, "benchmarks")
+    import gpu
+"""
+
+
+def on_a_bare_machine(code: str) -> str:
+    """What a program prints that cannot import what a bare machine lacks."""
     done = subprocess.run(
-        [sys.executable, "-c", textwrap.dedent(code)],
+        [sys.executable, "-c", textwrap.dedent(BARE) + code],
         cwd=ROOT,
         env=os.environ | {"PYTHONPATH": str(ROOT)},
         capture_output=True,
         text=True,
         check=False,
     )
-    assert done.stdout.strip() == "3", done.stderr
+    assert done.returncode == 0, done.stderr
+    return done.stdout.strip()
+
+
+def test_it_is_imported_on_a_bare_machine():
+    assert on_a_bare_machine("print(len(gpu.CELLS))") == "3"
+
+
+@pytest.mark.slow
+def test_it_measures_on_a_bare_machine(tmp_path):
+    cells = ["device", "parity", "a", "physics+render at 8192", "training at 8192"]
+    arguments = ["--json", str(tmp_path), "--tiny", "--minutes", "30", "--cells", *cells]
+    said = on_a_bare_machine(f"gpu.main({arguments!r})")
+    assert said.count(" s\n") + 1 == len(cells)
+    rows = [row for file in tmp_path.glob("*.json") for row in gpu.read(tmp_path, file.stem)]
+    assert sorted(row["cell"] for row in rows) == sorted(cells)
+    assert not [row for row in rows if "failed" in row]
+
+
+def test_the_row_of_the_device_says_what_is_installed(tmp_path):
+    cell = gpu.CELLS[""][0]
+    cell.measure(gpu.Visit(tiny=True, deadline=0.0), gpu.append(tmp_path, cell))
+    (row,) = gpu.read(tmp_path, "device")
+    assert row["devices"] == jax.device_count()
+    assert row["versions"]["jaxlib"] == importlib.metadata.version("jaxlib")
+    assert row["versions"]["chex"] == importlib.metadata.version("chex")
+    # No GPU here, or a driver with a number.
+    assert row["driver"] is None or row["driver"][0].isdigit()
+
+
+def test_what_is_not_there_is_none():
+    assert versions("no-such-package")["no-such-package"] is None
+    assert gpu.first_line(["no-such-program"]) is None
+    assert gpu.first_line([sys.executable, "-c", "print(1); raise SystemExit(1)"]) is None
+    assert gpu.first_line([sys.executable, "-c", "print(1); print(2)"]) == "1"
+
+
+def test_parity_is_measured_with_each_stored_backend():
+    pixels = np.zeros((1, 2, 2), np.uint32)
+    data = base64.b64encode(zlib.compress(pixels.tobytes())).decode()
+    images = {"shape": [1, 2, 2], "data": data}
+    stored = {"machine": {"cpu": "X"}, "images": images}
+    # Two iterations of one arm with two joints.
+    stored["qpos"] = {"native": [[[0.0, 0.0]], [[0.0, 1.0]]], "mjx": [[[0.0, 0.5]], [[0.0, 1.0]]]}
+    now = {"backend": "mjx", "images": images, "qpos": [[[0.0, 0.5]], [[0.25, 1.0]]]}
+    row = gpu.compare(stored, now)
+    assert row["largest_difference_of_qpos"] == {"native": 0.5, "mjx": 0.25}
+    assert row["by_iteration"] == {"native": [0.5, 0.25], "mjx": [0.0, 0.25]}
+    assert row["share_of_pixels_of_another_geom"] == row["largest_difference_of_colour"] == 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("physics", ["native", "mjx"])
+def test_the_stored_values_are_those_of_this_code(physics):
+    """If not, `benchmarks/gpu.py --store` writes them again."""
+    row = gpu.compare(json.loads(gpu.STORED.read_text()), gpu.compute(physics))
+    assert row["share_of_pixels_of_another_geom"] == 0
+    assert row["largest_difference_of_colour"] <= 1
+    assert row["largest_difference_of_qpos"][physics] <= 1e-6
+
+
+def test_a_row_has_as_many_samples_a_step_as_the_preset():
+    preset = mjx_arm.PRESETS["gpu"]
+    options = gpu._with_own_ratio(8_192)
+    config = set_train_options(preset, {"num_envs": 8_192, **options})
+    assert config.samples_per_step == preset.samples_per_step == 2
+    assert config.algo.student_batch_size == 2 * preset.algo.student_batch_size
 
 
 @pytest.mark.long

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import importlib.metadata
 import pathlib
+import subprocess
 import sys
 
 import pytest
@@ -46,3 +48,35 @@ def test_a_folder_that_is_not_empty_is_refused(tmp_path):
 def test_a_folder_without_wheels_installs_nothing(tmp_path, capsys):
     assert wheels.install(tmp_path) == 2
     assert "holds no wheels" in capsys.readouterr().err
+
+
+def test_versions_of_the_image_are_compared_with_the_bounds(tmp_path):
+    pyproject = tmp_path / "pyproject.toml"
+    listed = ["jax>=0.10,<0.13", "flax>=0.12.6", "optax>=0.2.8", "chex>=0.1.92", "mujoco>=9"]
+    pyproject.write_text(f"[project]\ndependencies = {listed}\n")
+    image = {"jax": "0.13.0", "flax": "0.12.10", "optax": "0.2.8"}
+
+    def installed(name: str) -> str:
+        if name not in image:
+            raise importlib.metadata.PackageNotFoundError(name)
+        return image[name]
+
+    said = wheels.mismatches(pyproject, installed)
+    assert len(said) == 2
+    assert "jax 0.13.0 is installed, and pyproject.toml asks for jax<0.13,>=0.10" in said
+    assert "chex is not installed, and pyproject.toml asks for chex>=0.1.92" in said
+
+
+def test_this_environment_is_within_the_bounds():
+    assert wheels.mismatches() == []
+
+
+def test_an_installation_prints_each_mismatch(tmp_path, monkeypatch, capsys):
+    folder = tmp_path / "wheels"
+    folder.mkdir()
+    (folder / "one-1-py3-none-any.whl").write_bytes(b"x")
+    done = subprocess.CompletedProcess([], 0)
+    monkeypatch.setattr(wheels.subprocess, "run", lambda *_, **__: done)
+    monkeypatch.setattr(wheels, "mismatches", lambda: ["jax 1 is installed"])
+    assert wheels.install(folder) == 0
+    assert "warning: jax 1 is installed" in capsys.readouterr().err

@@ -56,24 +56,20 @@ def test_pages_and_notebooks_are_found():
     assert len(NOTEBOOKS) == 5
 
 
-# Its snippets need several devices.
-_TEXT_ALLOWED = ("scaling.md",)
-
-
 def test_every_language_of_the_pages_is_tested():
     """`text` is no code; `python`, `sh` and `json` are tried by test_snippets.py."""
     for path in PAGES:
         for each in snippets(path.read_text(), path.name):
             where = f"{path.name}, line {each.line}"
             assert each.language in ("python", "sh", "json", "text"), where
-            assert each.mark in ("", "slow", "peers", "check"), where
+            assert each.mark in ("", "slow", "peers", "check", "devices"), where
 
 
 @pytest.mark.parametrize("path", PAGES, ids=lambda path: path.stem)
 def test_what_is_marked_as_text_is_no_python(path: pathlib.Path):
     """Or no test would run it."""
     for each in snippets(path.read_text(), path.name):
-        if each.language == "text" and path.name not in _TEXT_ALLOWED:
+        if each.language == "text":
             with pytest.raises(SyntaxError):
                 compile(each.text, path.name, "exec")
 

@@ -57,10 +57,16 @@ _CHEAP_TRAINING = ("train", "--preset", "smoke", "--out", "runs/first")
 # Scripts for Slurm, and what their variables are in the tests.
 _SBATCH = sorted((ROOT / "docs").rglob("*.sbatch"))
 _VARIABLES = {"$run": "runs/first", "$RUN": "runs/first"}
+# Marks of Python that this process cannot run.
+_ELSEWHERE = ("check", "devices")
 
 
 def _name(snippet: Snippet) -> str:
     return f"{snippet.page}:{snippet.line}"
+
+
+def _marked(language: str, mark: str) -> list[Snippet]:
+    return [each for each in all_snippets(language) if each.mark == mark]
 
 
 @pytest.fixture
@@ -81,6 +87,8 @@ def _python_pages() -> list[object]:
     found = []
     key = lambda each: (each.page, each.mark)  # noqa: E731
     for (page, mark), group in itertools.groupby(sorted(all_snippets("python"), key=key), key):
+        if mark in _ELSEWHERE:
+            continue
         # The README has no room for a comment, and its snippet compiles for half a minute.
         mark = "slow" if page == "README.md" else mark
         marks = [getattr(pytest.mark, mark)] if mark else []
@@ -99,6 +107,35 @@ def test_python_snippets_run(
         code = "\n" * (each.line - 1) + each.text
         path = str(ROOT / each.page)
         exec(compile(code, path, "exec", dont_inherit=True), module.__dict__)
+
+
+@pytest.mark.parametrize("snippet", _marked("python", "check"), ids=_name)
+def test_python_snippets_for_other_machines_compile(snippet: Snippet):
+    compile(snippet.text, snippet.page, "exec", dont_inherit=True)
+
+
+@pytest.mark.slow
+def test_python_snippets_for_several_devices_run():
+    """With four devices and a short training as `config`."""
+    values = _SHORT | _SHORT_BATCH["dqn"] | {"observation": "state"}
+    del values["eval-episodes"]
+    options = {name.replace("-", "_"): value for name, value in values.items()}
+    group = _marked("python", "devices")
+    assert {each.page for each in group} == {"docs/scaling.md"}
+    code = f"import mjx_arm\n\nconfig = mjx_arm.train_config(**{options!r})\n"
+    code += "".join(each.text for each in group)
+    code += "print(mesh.size, states.envs.ended.shape, counts['steps'].shape)\n"
+    flags = "--xla_force_host_platform_device_count=4"
+    done = subprocess.run(
+        [sys.executable, "-W", "error", "-c", code],
+        env=os.environ | {"XLA_FLAGS": flags, "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    # Eight seeds of eight environments, two chunks.
+    assert done.stdout == "4 (8, 8) (8, 2)\n"
 
 
 @pytest.mark.parametrize("snippet", _SHELL, ids=_name)

@@ -55,6 +55,23 @@ def grasping_controls(lab, length: int) -> np.ndarray:
     return controls
 
 
+@pytest.mark.parametrize(
+    ("simulations", "devices", "cores", "threads"),
+    [
+        (64, 1, 8, 8),
+        (64, 4, 8, 2),
+        # What does not divide is rounded down: more threads than cores would wait for one another.
+        (64, 3, 8, 2),
+        (64, 8, 2, 1),
+        (3, 1, 8, 3),
+    ],
+)
+def test_local_devices_divide_the_cores(simulations, devices, cores, threads, monkeypatch):
+    monkeypatch.setattr(jax, "local_device_count", lambda: devices)
+    monkeypatch.setattr(native, "usable_cores", lambda: cores)
+    assert native._num_threads(simulations) == threads
+
+
 def test_a_scan_is_a_plain_loop_of_mujoco_to_the_bit(lab):
     model = lab.scene.mj_model
     qpos, _ = grasp_starts(lab)

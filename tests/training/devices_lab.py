@@ -6,6 +6,7 @@ XLA_FLAGS=--xla_force_host_platform_device_count=4 python tests/training/devices
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import json
 import sys
 
@@ -15,12 +16,13 @@ import numpy as np
 import optax
 from jax.sharding import PartitionSpec as P
 
-from mjx_arm.algos.distill import Distill
+from mjx_arm.algos import distill
 from mjx_arm.algos.dqn import QLearning
 from mjx_arm.algos.frames import Frames
 from mjx_arm.algos.replay import Batch, Step, init_replay, sample
 from mjx_arm.config import DistillConfig, set_train_options, train_config
 from mjx_arm.networks import FeatureQNetwork
+from mjx_arm.presets import PRESETS
 from mjx_arm.training.evaluate import make_evaluator
 from mjx_arm.training.loop import make_train, make_trainer, run_keys
 from mjx_arm.training.memory import memory_plan
@@ -38,6 +40,26 @@ CONFIG = train_config(
     chunk_steps=160,
     max_steps=15,
     hidden=16,
+)
+# The default preset, from pixels. The student learns from the second chunk on.
+DISTILL = set_train_options(
+    PRESETS["fast"],
+    {
+        "env": "B",
+        "physics": "native",
+        "size": (16, 16),
+        "num_envs": 8,
+        "replay_size": 800,
+        "learning_starts": 40,
+        "chunk_steps": 160,
+        "max_steps": 15,
+        "widths": (4, 4, 4),
+        "hidden": 16,
+        "teacher_hidden": 16,
+        "teacher_batch_size": 16,
+        "student_batch_size": 8,
+        "student_starts": 160,
+    },
 )
 
 
@@ -60,6 +82,15 @@ def gap(one, other) -> float:
     return max(float(np.abs(np.asarray(a) - np.asarray(b)).max()) for a, b in pairs)
 
 
+def copies_agree(tree) -> bool:
+    """Whether each device has the same copy of every array of a tree."""
+    return all(
+        np.array_equal(x.addressable_shards[0].data, shard.data)
+        for x in jax.tree.leaves(tree)
+        for shard in x.addressable_shards
+    )
+
+
 def run_chunks(trainer, chunks: int):
     state, rows = trainer.start(), []
     for _ in range(chunks):
@@ -68,7 +99,7 @@ def run_chunks(trainer, chunks: int):
     return state, rows
 
 
-class Plain(Distill):
+class Plain(distill.Distill):
     """Without Adam, which divides small gradients by their own size and so enlarges rounding."""
 
     _optimizer = optax.sgd(0.01)
@@ -87,8 +118,6 @@ def training() -> dict:
         state, counts = trainer.run_chunk(state)
         rows.append({name: float(x) for name, x in fetch(counts).items()})
     again = [event for event in compilations if "backend_compile" in event]
-    copies = [shard.data for x in jax.tree.leaves(state.learner) for shard in x.addressable_shards]
-    by_leaf = np.array_split(np.arange(len(copies)), len(copies) // mesh.size)
     starts = np.asarray(state.replay.steps.frame["features"])[0]
     policy = fetch(trainer.algorithm.policy(state.learner))
     results = [
@@ -101,11 +130,52 @@ def training() -> dict:
         "counts": rows,
         "compiled_again": again,
         "spread": [str(x.sharding.spec) for x in (state.envs.ended, state.replay.steps.reward)],
-        "copies_agree": all(np.array_equal(copies[i[0]], copies[j]) for i in by_leaf for j in i),
+        "copies_agree": copies_agree(state.learner),
         "different_starts": len(np.unique(starts, axis=0)),
         "plan": memory_plan(trainer.shapes()),
         "plan_alone": memory_plan(alone.shapes()),
         "evaluations": [dataclasses.asdict(result) for result in results],
+    }
+
+
+def distillation() -> dict:
+    """A training from pixels, until the student has driven its environments for two chunks."""
+    # The student drives from the third chunk on, instead of 100,000 steps later.
+    distill._WARM_UP = DISTILL.chunk_steps
+    mesh = make_mesh(jax.device_count())
+    trainer, alone = make_trainer(DISTILL, mesh=mesh), make_trainer(DISTILL)
+    state, rows = trainer.start(), []
+    images = [fetch(state.obs)]
+    for _ in range(4):
+        state, counts = trainer.run_chunk(state)
+        rows.append({name: float(x) for name, x in fetch(counts).items()})
+        images.append(fetch(state.obs))
+
+    def q_values(trainer):
+        def both(learner, envs, obs):
+            algorithm = trainer.algorithm
+            frame = algorithm.frames.encode(envs, obs)
+            return [
+                algorithm.q_values(learner, obs, frame, jnp.int32(steps)) for steps in (0, 10_000)
+            ]
+
+        return both
+
+    spec = P(shard_of(mesh).axis)
+    spread = sharded(q_values(trainer), mesh, (P(), spec, spec), spec)
+    own = jax.jit(spread)(state.learner, state.envs, state.obs)
+    whole = jax.device_put((state.learner, state.envs, state.obs), jax.devices()[0])
+    of_teacher, mixed = jax.jit(q_values(alone))(*whole)
+    shown = np.asarray(jax.jit(alone.algorithm.frames.observe)(whole[1]))
+    return {
+        "counts": rows,
+        "spread": [str(x.sharding.spec) for x in (state.obs, state.replay.steps.reward)],
+        "copies_agree": copies_agree(state.learner),
+        "rendered": [not np.array_equal(x, y) for x, y in itertools.pairwise(images)],
+        "different_images": len(np.unique(shown.reshape(len(shown), -1), axis=0)),
+        "share_of_other_pixels": float(np.mean(shown != images[-1])),
+        "gap": gap((of_teacher, mixed), own),
+        "driven": np.flatnonzero(np.any(np.asarray(of_teacher != mixed), axis=1)).tolist(),
     }
 
 

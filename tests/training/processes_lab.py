@@ -1,6 +1,6 @@
 """What several processes agree on, as JSON; `test_processes.py` starts it and judges.
 
-python tests/training/processes_lab.py HOST:PORT NUM_PROCESSES PROCESS_ID
+python tests/training/processes_lab.py [HOST:PORT NUM_PROCESSES PROCESS_ID]
 """
 
 from __future__ import annotations
@@ -18,13 +18,16 @@ def fail() -> str:
     raise ValueError("only process 0 can say this")
 
 
-def main(coordinator: str, num_processes: int, process_id: int) -> None:
-    processes.join_processes(coordinator, num_processes, process_id)
+def main(
+    coordinator: str | None = None, num_processes: str | None = None, process_id: str | None = None
+) -> None:
+    place = [None if x is None else int(x) for x in (num_processes, process_id)]
+    processes.join_processes(coordinator, *place)
     found = {
         "writer": processes.is_writer(),
         "alone": processes.alone(),
         "said": processes.on_writer(lambda: f"process {jax.process_index()} wrote"),
-        "one": processes.any_says(process_id == 1),
+        "one": processes.any_says(jax.process_index() == 1),
         "none": processes.any_says(False),
     }
     try:
@@ -40,4 +43,4 @@ def main(coordinator: str, num_processes: int, process_id: int) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1], int(sys.argv[2]), int(sys.argv[3]))
+    main(*sys.argv[1:])

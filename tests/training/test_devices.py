@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import pathlib
 import subprocess
@@ -84,6 +85,29 @@ def test_updates_from_the_same_samples_agree(lab):
 
 
 @pytest.mark.slow
+def test_a_student_that_sees_pixels_learns_and_acts_on_all_devices():
+    found = four_devices("distillation")["distillation"]
+    counts = found["counts"]
+    # 20 steps of 8 environments, of which each resets once in 16 steps.
+    assert sum(row["steps"] for row in counts) == 8 * (80 - 80 // 16)
+    assert sum(row["episodes"] for row in counts) == 8 * (80 // 16)
+    assert all(row["diverged"] == 0 for row in counts)
+    assert 0 < counts[0]["updates"] < 20
+    assert [row["updates"] for row in counts[1:]] == [20, 20, 20]
+    # Three updates of the student after each step.
+    assert [row["student_updates"] for row in counts] == [0, 60, 60, 60]
+    assert all(0 < row["student_loss"] < math.inf for row in counts[1:])
+    assert found["spread"] == ["P('device',)", "P(None, 'device')"]
+    assert found["copies_agree"]
+    # Nothing looks at an image before the step from which on the student drives.
+    assert found["rendered"] == [False, True, True, True]
+    assert found["different_images"] == 8
+    assert found["share_of_other_pixels"] < 0.01
+    assert found["driven"] == [1, 3, 5, 7]
+    assert found["gap"] < 1e-5
+
+
+@pytest.mark.slow
 def test_seeds_are_spread_where_their_number_allows_it():
     found = four_devices("seeds")["seeds"]
     assert found["spread"] == "P('device',)"
@@ -102,7 +126,7 @@ def test_a_whole_run_is_one_function_under_a_mesh():
     assert found["gap"] < 1e-5
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_native_physics_on_four_devices_never_hangs():
     found = four_devices("repeats", timeout=1800)["repeats"]
     assert found == {"steps": 200 * 20, "diverged": 0.0}

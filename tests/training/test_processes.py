@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import pathlib
 import signal
@@ -10,6 +11,8 @@ import socket
 import subprocess
 import sys
 import time
+import types
+from collections.abc import Iterator, Sequence
 
 import jax
 import numpy as np
@@ -17,6 +20,7 @@ import pytest
 
 from mjx_arm.cli import main
 from mjx_arm.report.metrics import read_metrics
+from mjx_arm.training import processes
 from mjx_arm.training.checkpoint import RunCheckpoints
 from mjx_arm.training.loop import make_trainer, run_keys
 from mjx_arm.training.processes import detects_processes, join_processes
@@ -34,39 +38,55 @@ OPTIONS = [
 TOTAL = ["--total-steps", "6400"]
 # A run that no test waits for.
 LONG = ["--total-steps", "100000000"]
+# The default preset, from pixels. The student learns from the second chunk on.
+DISTILL = [
+    *("--preset", "fast", "--env", "B", "--physics", "native", "--num-envs", "8"),
+    *("--replay-size", "800", "--learning-starts", "40", "--hidden", "16"),
+    *("--chunk-steps", "160", "--max-steps", "15", "--size", "16", "16"),
+    *("--widths", "4", "4", "4", "--teacher-hidden", "16", "--teacher-batch-size", "16"),
+    *("--student-batch-size", "8", "--student-starts", "160", "--select-every", "0"),
+]
+_started: list[subprocess.Popen] = []
 
 
-def start(*command: str, processes: int = 2, devices: int = 2) -> list[subprocess.Popen]:
+@pytest.fixture(autouse=True)
+def no_process_outlives_its_test() -> Iterator[None]:
+    yield
+    for process in _started:
+        process.kill()
+        process.communicate()
+    _started.clear()
+
+
+def spawn(command: Sequence[str], devices: int, **environment: str) -> subprocess.Popen:
+    """Starts one process of a program."""
+    flags = f"--xla_force_host_platform_device_count={devices}"
+    process = subprocess.Popen(
+        [sys.executable, *command],
+        env=os.environ | {"XLA_FLAGS": flags, "PYTHONPATH": str(ROOT)} | environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    _started.append(process)
+    return process
+
+
+def start(*command: str, number: int = 2, devices: int = 2) -> list[subprocess.Popen]:
     """Starts the processes of one program, which takes its place among them as options."""
     with socket.socket() as free:
         free.bind(("localhost", 0))
         port = free.getsockname()[1]
-    flags = f"--xla_force_host_platform_device_count={devices}"
-    env = os.environ | {"XLA_FLAGS": flags, "PYTHONPATH": str(ROOT)}
-    place = [f"localhost:{port}", str(processes)]
+    place = [f"localhost:{port}", str(number)]
     if command[0] == "-m":
         place = ["--coordinator", place[0], "--num-processes", place[1], "--process-id"]
-    return [
-        subprocess.Popen(
-            [sys.executable, *command, *place, str(process)],
-            env=env,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-        )
-        for process in range(processes)
-    ]
+    return [spawn([*command, *place, str(i)], devices) for i in range(number)]
 
 
 def finish(started: list[subprocess.Popen], timeout: float = 900) -> list[tuple[int, str, str]]:
-    """Exit status, output and errors of each process; none outlives the test."""
+    """Exit status, output and errors of each process."""
     deadline = time.monotonic() + timeout
-    try:
-        ended = [x.communicate(timeout=max(1.0, deadline - time.monotonic())) for x in started]
-    finally:
-        for process in started:
-            process.kill()
-            process.communicate()
+    ended = [x.communicate(timeout=max(1.0, deadline - time.monotonic())) for x in started]
     return [(x.returncode, *texts) for x, texts in zip(started, ended, strict=True)]
 
 
@@ -74,11 +94,15 @@ def train(*arguments: str) -> list[subprocess.Popen]:
     return start("-m", "mjx_arm", "train", *arguments)
 
 
-def wait_for_checkpoint(folder: pathlib.Path, started: list[subprocess.Popen]) -> None:
+def wait_for_checkpoint(
+    folder: pathlib.Path, started: list[subprocess.Popen], after: int = 0
+) -> None:
+    """Waits for a checkpoint of a later vector step."""
     deadline = time.monotonic() + 600
-    while RunCheckpoints(folder).newest() is None:
+    while max(RunCheckpoints(folder).steps(), default=0) <= after:
         assert time.monotonic() < deadline
-        assert all(process.poll() is None for process in started), finish(started)
+        ended = [process.communicate() for process in started if process.poll() is not None]
+        assert not ended, ended
         time.sleep(0.1)
 
 
@@ -101,8 +125,9 @@ def same(one: pathlib.Path, other: pathlib.Path) -> bool:
     )
 
 
-def test_processes_agree():
-    ended = finish(start(str(LAB)), timeout=300)
+def assert_agreed(started: list[subprocess.Popen]) -> None:
+    """Asserts what the lab's processes have agreed on."""
+    ended = finish(started, timeout=300)
     assert [status for status, *_ in ended] == [0, 0], ended
     # Before it gloo reports its connections.
     first, second = (json.loads(output.splitlines()[-1]) for _, output, _ in ended)
@@ -117,6 +142,34 @@ def test_processes_agree():
         "devices": 4,
         "key": [0, 3],
     }
+
+
+def test_processes_agree():
+    assert_agreed(start(str(LAB)))
+
+
+@pytest.mark.slow
+def test_processes_that_open_mpi_starts_find_one_another():
+    """With its variables alone, on loopback."""
+    # jax takes the port from the number of the job.
+    first = 2**16 - 2**12
+    port = next(port for port in range(first, 2**16) if is_free(port))
+    uri = f"{(port - first) * 2**12}.0;tcp://127.0.0.1:1"
+    common = {"OMPI_MCA_orte_hnp_uri": uri, "OMPI_COMM_WORLD_SIZE": "2"}
+    started = []
+    for process in ("0", "1"):
+        own = {"OMPI_COMM_WORLD_RANK": process, "OMPI_COMM_WORLD_LOCAL_RANK": process}
+        started.append(spawn([str(LAB)], 2, **common, **own))
+    assert_agreed(started)
+
+
+def is_free(port: int) -> bool:
+    with socket.socket() as tried:
+        try:
+            tried.bind(("127.0.0.1", port))
+        except OSError:
+            return False
+    return True
 
 
 SLURM = {
@@ -146,6 +199,51 @@ SLURM = {
 )
 def test_several_processes_are_those_that_a_launcher_reports(environ, several):
     assert detects_processes(environ) is several
+
+
+POD = {
+    "KUBERNETES_SERVICE_HOST": "10.0.0.1",
+    "HOSTNAME": "training-job-1",
+    "JOB_COMPLETION_INDEX": "1",
+}
+
+
+@pytest.mark.parametrize(
+    ("parallelism", "completions", "several"),
+    [
+        (1, 1, False),
+        (2, 2, True),
+        # Kubernetes starts no more pods than are to complete.
+        (4, 1, False),
+        # Four pods one after another.
+        (1, 4, False),
+        # Kubernetes does not answer: jax says why.
+        (None, None, True),
+    ],
+)
+def test_pods_of_an_indexed_job_are_several_if_they_run_at_once(
+    parallelism, completions, several, monkeypatch, tmp_path
+):
+    def read_job(name, namespace):
+        assert (name, namespace) == ("training-job", "robots")
+        if parallelism is None:
+            raise PermissionError
+        spec = types.SimpleNamespace(parallelism=parallelism, completions=completions)
+        return types.SimpleNamespace(spec=spec)
+
+    package = types.ModuleType("kubernetes")
+    api = types.SimpleNamespace(read_namespaced_job=read_job)
+    package.config = types.SimpleNamespace(load_incluster_config=lambda: None)
+    package.client = types.SimpleNamespace(BatchV1Api=lambda: api)
+    monkeypatch.setitem(sys.modules, "kubernetes", package)
+    (tmp_path / "namespace").write_text("robots\n")
+    monkeypatch.setattr(processes, "_NAMESPACE", tmp_path / "namespace")
+    assert detects_processes(POD) is several
+
+
+def test_a_pod_without_the_client_of_kubernetes_is_one_process(monkeypatch):
+    monkeypatch.setitem(sys.modules, "kubernetes", None)
+    assert not detects_processes(POD)
 
 
 @pytest.mark.parametrize(
@@ -202,8 +300,57 @@ def test_a_run_of_two_processes_is_stopped_and_resumed_to_the_bit(tmp_path):
     assert names == sorted(path.name for path in cut.iterdir())
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("lost", [0, 1])
+@pytest.mark.slow
+def test_a_signal_to_one_of_two_processes_stops_both_and_two_resume(tmp_path, capsys):
+    folder = tmp_path / "run"
+    started = train(*OPTIONS, *LONG, "--out", str(folder))
+    wait_for_checkpoint(folder, started)
+    # The folder of a run of two processes is not for a third one.
+    assert main(["train", "--resume", str(folder)]) == 2
+    assert "is in use by another process" in capsys.readouterr().err
+    assert main(["train", *OPTIONS, "--out", str(folder)]) == 2
+    assert "is not empty" in capsys.readouterr().err
+    started[1].send_signal(signal.SIGTERM)
+    ended = finish(started)
+    assert [status for status, *_ in ended] == [130, 130], ended
+    assert "saved; continue with" in ended[0][2]
+    done = RunCheckpoints(folder).steps()[-1] * 8
+    arguments = ["--total-steps", str(done + 320), "--eval-episodes", "4"]
+    ended = finish(train("--resume", str(folder), *arguments))
+    assert [status for status, *_ in ended] == [0, 0], ended
+    assert f"resuming after {done:,} steps" in ended[0][1]
+    assert [row["env_steps"] for row in read_metrics(folder)] == list(range(160, done + 321, 160))
+
+
+@pytest.mark.slow
+def test_two_killed_processes_are_resumed_by_two(tmp_path):
+    """With the default preset, whose student sees pixels."""
+    folder = tmp_path / "run"
+    started = train(*DISTILL, *LONG, "--out", str(folder))
+    wait_for_checkpoint(folder, started)
+    for process in started:
+        process.kill()
+    ended = finish(started)
+    assert [status for status, *_ in ended] == [-signal.SIGKILL] * 2, ended
+    done = RunCheckpoints(folder).steps()[-1]
+    # Stopped again: an evaluation at the end would compile for longer than all of this.
+    resumed = train("--resume", str(folder))
+    wait_for_checkpoint(folder, resumed, after=done)
+    resumed[0].send_signal(signal.SIGTERM)
+    ended = finish(resumed)
+    assert [status for status, *_ in ended] == [130, 130], ended
+    assert f"resuming after {8 * done:,} steps" in ended[0][1]
+    rows = read_metrics(folder)
+    last = RunCheckpoints(folder).steps()[-1] * 8
+    assert [row["env_steps"] for row in rows] == list(range(160, last + 1, 160))
+    assert rows[0]["student_updates"] == 0
+    assert all(row["student_updates"] == 60 for row in rows[1:])
+    assert all(math.isfinite(row["student_loss"]) for row in rows[1:])
+
+
+@pytest.mark.parametrize(
+    "lost", [pytest.param(0, marks=pytest.mark.long), pytest.param(1, marks=pytest.mark.slow)]
+)
 def test_when_a_process_is_lost_the_others_end_and_the_run_resumes_with_one(lost, tmp_path):
     folder = tmp_path / "run"
     started = train(*OPTIONS, *LONG, "--out", str(folder))
@@ -230,7 +377,7 @@ def test_a_run_of_four_devices_is_resumed_to_the_bit_and_on_fewer(tmp_path):
 
     def run(*arguments: str) -> str:
         command = ("-m", "mjx_arm", "train", *arguments)
-        ((status, output, error),) = finish(start(*command, processes=1, devices=4))
+        ((status, output, error),) = finish(start(*command, number=1, devices=4))
         assert status == 0, error
         return output
 
