@@ -170,10 +170,17 @@ def test_a_task_with_the_ids_of_another_is_refused_and_not_registered(later):
     assert gymnasium.spec("mjx_arm/ArmCubeA-v0").kwargs["task"] == "lift"
 
 
-@pytest.mark.parametrize("name", ["", "own:task", "own task", "7", None])
+@pytest.mark.parametrize("name", ["", "own:task", "own task", "7"])
 def test_a_name_that_cannot_be_an_id_is_refused(name, later):
     with pytest.raises(ValueError, match="the name of a task must be a letter, then letters"):
         later(name, Reach)
+
+
+def test_what_makes_no_task_is_refused(later):
+    with pytest.raises(ValueError, match="name must be text, got None"):
+        later(None, Reach)
+    with pytest.raises(ValueError, match=r"'made_up' must be made by a function .*, got 'Reach'"):
+        later("made_up", "Reach")
 
 
 def test_bad_vector_options_are_refused():

@@ -11,7 +11,7 @@ from mjx_arm.envs.tasks.base import Task, TaskConfig
 from mjx_arm.envs.tasks.lift import Lift, LiftConfig
 from mjx_arm.envs.tasks.push import Push, PushConfig
 from mjx_arm.envs.tasks.reach import Reach, ReachConfig
-from mjx_arm.options import check_name
+from mjx_arm.options import check_name, check_value
 from mjx_arm.references import is_reference, load_module
 
 
@@ -57,7 +57,8 @@ def register(
         or `make` is no function.
     """
     entry = TaskEntry(make, config, scene)
-    if not _NAME.fullmatch(str(name)):
+    check_value("name", str, name)
+    if not _NAME.fullmatch(name):
         raise ValueError(
             f"the name of a task must be a letter, then letters, digits, _ and -, got {name!r}"
         )
