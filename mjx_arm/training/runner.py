@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import json
 import math
 import os
@@ -15,7 +16,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from types import FrameType, TracebackType
-from typing import Any, Self
+from typing import Any, ParamSpec, Self, TypeVar
 
 import flax.traverse_util
 import jax
@@ -94,6 +95,8 @@ from mjx_arm.training.run_folder import (
 _SELECTION_SEED = 2_000_003
 _EVALUATION_SEED = 1_000_003
 _EVALUATION_EPSILON = 0.1
+P = ParamSpec("P")
+R = TypeVar("R")
 Evaluate = Callable[[Any], Evaluation]
 RunChunk = Callable[[LoopState], tuple[LoopState, Counts]]
 # Called between two chunks with the metrics of each seed and the state.
@@ -118,6 +121,18 @@ class RunInterruptedError(Exception):
     """The user asked a run to stop; its state is saved."""
 
 
+def _with_rank_promotion(function: Callable[P, R]) -> Callable[P, R]:
+    """Allows rank promotion: JAX_NUMPY_RANK_PROMOTION is meant for the user's own programs."""
+
+    @functools.wraps(function)
+    def run(*args: P.args, **options: P.kwargs) -> R:
+        with jax.numpy_rank_promotion("allow"):
+            return function(*args, **options)
+
+    return run
+
+
+@_with_rank_promotion
 def train(
     config: TrainConfig,
     folder: str | pathlib.Path | None = None,
@@ -202,6 +217,7 @@ def train(
         return _finish_on_writer(made, run, objects, ending)
 
 
+@_with_rank_promotion
 def resume(
     folder: str | pathlib.Path,
     *,

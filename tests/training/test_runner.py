@@ -195,6 +195,16 @@ def test_the_folder_is_named_first_and_then_each_phase(plain):
     assert found == sorted(found)
 
 
+def test_a_program_that_forbids_rank_promotion_can_train(tmp_path):
+    """As by `JAX_NUMPY_RANK_PROMOTION=raise`, which is meant for the program's own arrays."""
+    with jax.numpy_rank_promotion("raise"):
+        train(tmp_path / "run")
+        resume(tmp_path / "run", total_steps=320)
+        with pytest.raises(ValueError, match="rank_promotion"):
+            jnp.ones((2, 3)) + jnp.ones(3)
+    assert [row["env_steps"] for row in read_metrics(tmp_path / "run")] == [80, 160, 240, 320]
+
+
 def test_own_parts_reach_a_trainer():
     def reward(before, after, action):
         return {"one": jnp.ones_like(after.measured["height"])}
