@@ -27,6 +27,7 @@ from mjx_arm.algos.collect import Counts
 from mjx_arm.config import TrainConfig, advice, set_train_options
 from mjx_arm.devices import check_device
 from mjx_arm.envs.env import make_env
+from mjx_arm.envs.tasks import find_task
 from mjx_arm.options import Count, Discount, Positive, check_value
 from mjx_arm.report.figures import plot_curves
 from mjx_arm.report.metrics import MetricsWriter, keep_metrics, last_env_steps, last_wall_s
@@ -785,7 +786,7 @@ def _draw_curves(
     folders: list[pathlib.Path], into: pathlib.Path, config: TrainConfig, console: Console
 ) -> None:
     with phase(console, "drawing the curves"):
-        paths = plot_curves(folders, into=into)
+        paths = plot_curves(folders, into=into, units=find_task(config.env.task).units)
     for path in paths:
         console.print(f"curves: {path}", soft_wrap=True)
 
