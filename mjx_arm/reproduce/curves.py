@@ -11,7 +11,7 @@ import numpy as np
 
 from mjx_arm.report.metrics import read_metrics
 
-# Success is regular from where half of so many episodes in a row end in success.
+# Success is regular from the first 100 episodes in a row of which half end in success.
 REGULAR_EPISODES, REGULAR_RATE = 100, 0.5
 # Points of a curve in a file.
 _MOST_POINTS = 300
