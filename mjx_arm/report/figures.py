@@ -7,7 +7,7 @@ import io
 import itertools
 import pathlib
 from collections.abc import Mapping, Sequence
-from typing import Literal
+from typing import Any, Literal
 
 import matplotlib
 import numpy as np
@@ -254,7 +254,7 @@ def _draw_panel(
         empty &= x.size == 0
         few = x.size < 30
         raw, smoothed = ("raw", "smoothed") if len(runs) == 1 else (None, name)
-        thin = {"lw": 0.8, "alpha": 0.35, "marker": "." if few else ""}
+        thin: dict[str, Any] = {"lw": 0.8, "alpha": 0.35, "marker": "." if few else ""}
         axes.plot(x, y, color=colour, label=raw, **thin)
         axes.plot(x, smooth(y), color=colour, lw=1.6, label=smoothed)
         if panel.dots is not None:
