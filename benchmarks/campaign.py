@@ -4,7 +4,9 @@
     python benchmarks/campaign.py --parts kills locks
     python benchmarks/campaign.py --table benchmarks/results/campaign.md
 
-Each part can run alone; all together take under two hours on two cores:
+It prints one table at the end, which `--table` also writes, beside the rows of earlier calls. Each
+part can run alone (`--parts`), and one that crashes leaves the others their rows. All together take
+under two hours on two cores; `tests/benchmarks/test_campaign.py` tries each at a small scale.
 
 - `kills`: runs are killed at random moments, with one seed and with two. Each must continue to the
   same bits as a run that was never killed.
@@ -39,7 +41,8 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+import traceback
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import jax
@@ -145,30 +148,50 @@ def kills(folder: pathlib.Path, scale: float) -> Iterator[Row]:
     """Kills runs at random moments; two of three have one seed."""
     moments = random.Random(0)
     for seeds, count in ((1, 24), (2, 12)):
-        count = max(1, round(count * scale))
         options = [*TINY, "--num-seeds", str(seeds)]
-        row = Row(
-            "kills",
-            f"SIGKILL at a random moment, {seeds} seed{'s' if seeds > 1 else ''}",
-            "continues to the bits of a run that was never killed",
-        )
         whole = folder / f"whole-{seeds}"
         run_to_end(whole, options)  # compiles
         shutil.rmtree(whole)
         started = time.monotonic()
         run_to_end(whole, options)
-        length, wanted, runs = time.monotonic() - started, fingerprint(whole), 0
-        while row.attempts < count:
-            own = folder / f"killed-{seeds}-{runs}"
-            died, error = _run_with_kills(own, options, moments, length, count - row.attempts)
-            same = not error and fingerprint(own) == wanted
-            # Every kill of a run whose end is right was survived.
-            for _ in range(max(died, 1)):
-                row.expect(same, error or f"run {runs} ends in other bits")
-            runs += 1
-            shutil.rmtree(own)
-        row.note = f"{runs} runs of {length:.0f} s"
+        length = time.monotonic() - started
+        what = f"SIGKILL at a random moment, {seeds} seed{'s' if seeds > 1 else ''}"
+        row = kill_runs(what, whole, options, moments, length, max(1, round(count * scale)))
+        row.note += f" of {length:.0f} s"
         yield row
+
+
+def kill_runs(
+    what: str,
+    whole: pathlib.Path,
+    options: list[str],
+    moments: random.Random,
+    length: float,
+    count: int,
+) -> Row:
+    """Kills runs a number of times, and compares their ends.
+
+    Args:
+      what: the row says of it.
+      whole: a run with the same options that was never killed. The others get folders beside it.
+      options: of the runs.
+      moments: chooses the moments.
+      length: seconds before which they are.
+      count: number of kills.
+    """
+    row = Row("kills", what, "continues to the bits of a run that was never killed")
+    wanted, runs = fingerprint(whole), 0
+    while row.attempts < count:
+        own = whole.with_name(f"{whole.name}-killed-{runs}")
+        died, error = _run_with_kills(own, options, moments, length, count - row.attempts)
+        same = not error and fingerprint(own) == wanted
+        # Every kill of a run whose end is right was survived. A run that none has met is repeated.
+        for _ in range(died if same else max(died, 1)):
+            row.expect(same, error or f"run {runs} ends in other bits")
+        runs += 1
+        shutil.rmtree(own)
+    row.note = f"{runs} run{'s' if runs > 1 else ''}"
+    return row
 
 
 def _run_with_kills(
@@ -273,7 +296,8 @@ def flips(folder: pathlib.Path, scale: float) -> Iterator[Row]:
 
     metrics = row("metrics.jsonl", "a damaged line is named; a changed digit is out of scope")
     path = whole / "metrics.jsonl"
-    for place in _places(path, rng, round(50 * scale)):
+    while metrics.attempts < max(1, round(50 * scale)):
+        (place,) = _places(path, rng, 1)
         with _flipped(path, place):
             if _is_metrics(path):
                 continue
@@ -540,19 +564,30 @@ def memory(folder: pathlib.Path, scale: float) -> Iterator[Row]:
         command(*long, "--out", folder / "run"), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE
     )
     seen: list[int] = []
-    end = time.monotonic() + 60 * minutes
-    while time.monotonic() < end and process.poll() is None:
-        time.sleep(min(5.0, 6 * minutes))
-        seen.append(_resident(process.pid))
-    process.kill()
-    process.communicate()
-    # The first fifth is starting and compiling.
-    started = seen[len(seen) // 5 :]
-    first, second = started[: len(started) // 2], started[len(started) // 2 :]
-    growth = max(second) / max(first) - 1
-    row.expect(growth <= 0.02, f"{100 * growth:.1f} % more")
-    row.note = f"{max(first) / 1e6:.0f} MB, then {max(second) / 1e6:.0f} MB"
+    try:
+        # Not while it starts and compiles.
+        while process.poll() is None and not _has_saved(folder / "run"):
+            time.sleep(0.1)
+        end = time.monotonic() + 60 * minutes
+        while time.monotonic() < end and process.poll() is None:
+            time.sleep(min(5.0, 6 * minutes))
+            seen.append(_resident(process.pid))
+    finally:
+        process.kill()
+        _, error = process.communicate()
+    first, second = seen[: len(seen) // 2], seen[len(seen) // 2 :]
+    if not first:
+        row.expect(False, f"it ended by itself: {error.decode(errors='replace')}")
+    else:
+        growth = max(second) / max(first) - 1
+        row.expect(growth <= 0.02, f"{100 * growth:.1f} % more")
+        row.note = f"{max(first) / 1e6:.0f} MB, then {max(second) / 1e6:.0f} MB"
     yield row
+
+
+def _has_saved(run: pathlib.Path) -> bool:
+    """Whether a run has a whole checkpoint."""
+    return any((run / "checkpoints").glob("[0-9]*"))
 
 
 def _resident(pid: int) -> int:
@@ -573,37 +608,50 @@ PARTS: dict[str, Callable[[pathlib.Path, float], Iterator[Row]]] = {
 }
 
 
-def run_part(name: str, scale: float = 1.0) -> tuple[list[Row], float]:
-    """The rows of a part and the seconds that it took.
+@dataclasses.dataclass
+class Result:
+    """What a part came to.
+
+    Attributes:
+      rows: of the table.
+      seconds: that it took.
+    """
+
+    rows: list[Row]
+    seconds: float = 0.0
+
+    def to_json(self) -> dict[str, Any]:
+        """The result as a JSON object, with the machine."""
+        rows = [dataclasses.asdict(row) for row in self.rows]
+        return {"rows": rows, "seconds": round(self.seconds), "machine": machine()}
+
+
+def run_part(name: str, scale: float = 1.0) -> Result:
+    """Runs a part. One that crashes keeps its finished rows, and has one more about the crash.
 
     Args:
       name: of the part.
       scale: share of the attempts.
     """
-    started = time.monotonic()
+    started, result = time.monotonic(), Result([])
     with tempfile.TemporaryDirectory() as folder:
         # The processes of a part share what one of them has compiled. The next part gets a new
         # folder: a process that is killed may leave half a program there.
         os.environ["JAX_COMPILATION_CACHE_DIR"] = f"{folder}/cache"
-        rows = list(PARTS[name](pathlib.Path(folder), scale))
-    return rows, time.monotonic() - started
+        try:
+            result.rows.extend(PARTS[name](pathlib.Path(folder), scale))
+        except Exception as error:
+            traceback.print_exc()
+            row = Row(name, "the part itself", "runs to its end")
+            row.expect(False, f"{type(error).__name__}: {error}")
+            result.rows.append(row)
+    result.seconds = time.monotonic() - started
+    return result
 
 
-def write_table(path: pathlib.Path, name: str, rows: list[Row], seconds: float) -> None:
-    """Writes the rows of a part into a table, in the place of older ones of the same part."""
-    store = path.with_suffix(".json")
-    parts = json.loads(store.read_text()) if store.is_file() else {}
-    parts[name] = {
-        "rows": [dataclasses.asdict(row) for row in rows],
-        "seconds": round(seconds),
-        "machine": machine(),
-    }
-    store.write_text(json.dumps(parts, indent=1) + "\n")
+def table(parts: Mapping[str, Any]) -> str:
+    """The results of parts, as JSON objects by their names, as a table in Markdown."""
     lines = [
-        "# The campaign",
-        "",
-        "`python benchmarks/campaign.py --table FILE` wrote this page; see its docstring.",
-        "",
         "| part | tried | must | attempts | failed | note |",
         "| --- | --- | --- | --- | --- | --- |",
     ]
@@ -617,28 +665,49 @@ def write_table(path: pathlib.Path, name: str, rows: list[Row], seconds: float) 
             own = parts[part]["machine"]
             where = f"{own['cpu']}, {own['cores']} cores, Python {own['python']}, jax {own['jax']}"
             lines.append(f"| {part} | {parts[part]['seconds']} | {where} |")
+    return "\n".join(lines)
+
+
+def write_table(path: pathlib.Path, new: Mapping[str, Any]) -> None:
+    """Writes results into a table, in the place of older ones of the same parts."""
+    store = path.with_suffix(".json")
+    parts = json.loads(store.read_text()) if store.is_file() else {}
+    parts |= new
+    store.write_text(json.dumps(parts, indent=1) + "\n")
+    lines = [
+        "# The campaign",
+        "",
+        "`python benchmarks/campaign.py --table FILE` wrote this page; see its docstring.",
+        "",
+        table(parts),
+    ]
     path.write_text("\n".join(lines) + "\n")
 
 
-def main() -> int:
-    """Runs the parts, prints a line for each row, and returns 1 where something broke."""
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Runs the parts, prints their failures and a table, and returns 1 where something broke."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--parts", nargs="+", choices=list(PARTS), default=list(PARTS))
     parser.add_argument("--scale", type=float, default=1.0, help="share of the attempts")
     parser.add_argument("--table", type=pathlib.Path, help="Markdown file, with JSON beside it")
-    arguments = parser.parse_args()
+    options = parser.parse_args(arguments)
     console, broken = Console(soft_wrap=True), False
-    for name in arguments.parts:
-        rows, seconds = run_part(name, arguments.scale)
-        for row in rows:
-            broken = broken or bool(row.failures)
-            failed = f"{len(row.failures)} of {row.attempts} failed"
-            console.print(f"{name}: {row.tried}: {failed} {row.note}", markup=False)
-            for failure in row.failures:
-                console.print(f"  {failure}", markup=False)
-        console.print(f"{name}: {seconds:.0f} s", markup=False)
-        if arguments.table:
-            write_table(arguments.table, name, rows, seconds)
+    done: dict[str, Any] = {}
+    try:
+        for name in options.parts:
+            result = run_part(name, options.scale)
+            done[name] = result.to_json()
+            for row in result.rows:
+                broken = broken or bool(row.failures)
+                failed = f"{len(row.failures)} of {row.attempts} failed"
+                console.print(f"{name}: {row.tried}: {failed} {row.note}", markup=False)
+                for failure in row.failures:
+                    console.print(f"  {failure}", markup=False)
+            if options.table:
+                write_table(options.table, {name: done[name]})
+    finally:
+        # After Ctrl-C too.
+        console.print(table(done), markup=False)
     return 1 if broken else 0
 
 

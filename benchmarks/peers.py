@@ -274,7 +274,7 @@ def sb3(env: gymnasium.Env, steps: int) -> Callable[[], float]:
 def our_training(config: TrainConfig) -> Callable[[], float]:
     """Environment steps a second of the whole loop."""
     trainer = make_trainer(config)
-    # The carry is donated, and so goes on from one measurement to the next.
+    # The carry is donated, so each measurement starts from the state that the one before left.
     state = [trainer.run_chunk(trainer.init(jax.random.key(0)))[0]]
 
     def run() -> None:

@@ -7,7 +7,7 @@ held-out episodes succeeded. Stable-Baselines3 then trains for at most 5 times a
 the best of ours (our network, 64 of our environments in one call, our reward, exploration, 3-step
 returns and averaged target, which also is what is judged), once with its defaults on one of our
 environments, and is judged as often and in the same way. Both take hours: with `--keep FOLDER` they
-are saved at every judgement, which their time does not count, and the same command goes on.
+are saved at every judgement, which their time does not count, and the same command resumes them.
 
 Without a run ours is what the file of results has from before, and theirs is added to it.
 
@@ -135,7 +135,7 @@ def make_envs(config: TrainConfig, num_envs: int, **changes: Any) -> ArmCubeVecE
 
 
 class Judge:
-    """Tries an agent: one episode in each of so many environments, all of them counted."""
+    """Tries an agent: one episode in each of `select_episodes` environments, all counted."""
 
     def __init__(self, config: TrainConfig):
         self._envs = make_envs(config, config.select_episodes, max_steps=1000)
@@ -157,7 +157,7 @@ class Judge:
 
 
 class Judging(BaseCallback):
-    """Judges every so many steps, and stops at the goal or when the time is over."""
+    """Judges every `every` steps, and stops at the goal or when the time is over."""
 
     def __init__(
         self,
@@ -286,7 +286,7 @@ def main() -> None:
     parser.add_argument("--learners", nargs="+", choices=LEARNERS, default=list(LEARNERS))
     parser.add_argument("--minutes", type=float, help="5 times ours where left out")
     parser.add_argument("--threads", type=int, help="of PyTorch; all cores where left out")
-    parser.add_argument("--keep", type=pathlib.Path, help="folder to go on from another time")
+    parser.add_argument("--keep", type=pathlib.Path, help="folder to save in and resume from")
     parser.add_argument("--json", type=pathlib.Path, help="file for the results")
     options = parser.parse_args()
     if options.threads:

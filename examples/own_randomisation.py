@@ -44,7 +44,8 @@ class VariedLift(Lift):
         return qpos, ctrl, {"geom_rgba": placement["rgba"][None], "pair_friction": friction}
 
 
-mjx_arm.register("varied_lift", VariedLift, config=LiftConfig, scene="arm_cube")
+units = {"height": "m", "distance": "m"}
+mjx_arm.register("varied_lift", VariedLift, config=LiftConfig, scene="arm_cube", units=units)
 
 
 def main() -> None:

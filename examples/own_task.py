@@ -41,7 +41,7 @@ class RaiseHand:
         return {"height": after.measured["height"], "success": 10.0 * after.measured["success"]}
 
 
-mjx_arm.register("raise_hand", RaiseHand, scene="arm_cube")
+mjx_arm.register("raise_hand", RaiseHand, scene="arm_cube", units={"height": "m"})
 
 
 def main() -> None:

@@ -1,6 +1,8 @@
 from __future__ import annotations
 
 import concurrent.futures
+import contextlib
+import io
 import json
 import pathlib
 import subprocess
@@ -26,8 +28,15 @@ from mjx_arm.options import flat_names
 from mjx_arm.presets import PRESETS
 from mjx_arm.report.metrics import read_metrics
 from mjx_arm.scene import SceneSource, load_scene
+from mjx_arm.training import runner
 from mjx_arm.training.agent import load_agent, read_agent, save_agent
-from mjx_arm.training.run_folder import SavedRun, load_config, new_run_folder, save_run
+from mjx_arm.training.run_folder import (
+    SavedRun,
+    choose_run_folder,
+    load_config,
+    new_run_folder,
+    save_run,
+)
 
 TINY = [
     *(
@@ -52,7 +61,10 @@ TINY = [
 @pytest.fixture(scope="module")
 def run_folder(tmp_path_factory) -> pathlib.Path:
     folder = tmp_path_factory.mktemp("run") / "tiny"
-    assert main(["train", *TINY, "--out", str(folder)]) == 0
+    output = io.StringIO()
+    with contextlib.redirect_stdout(output):
+        assert main(["train", *TINY, "--out", str(folder)]) == 0
+    (folder.parent / "output.txt").write_text(output.getvalue())
     return folder
 
 
@@ -69,6 +81,46 @@ def test_a_run_leaves_everything(run_folder):
     assert json.loads((run_folder / "evaluation.json").read_text())["episodes"] == 6
     config = load_config(run_folder)
     assert (config.total_steps, config.env.physics) == (400, "native")
+
+
+def test_the_folder_is_named_before_the_preset_and_the_device(run_folder):
+    lines = (run_folder.parent / "output.txt").read_text().splitlines()
+    assert lines[:2] == [f"run folder: {run_folder}", "preset: pixels"]
+    assert lines[2].startswith("device: ")
+
+
+def test_a_run_that_is_rejected_names_a_folder_and_makes_none(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(["train", *TINY, "--init-from", "nowhere"]) == 2
+    said = capsys.readouterr()
+    assert said.out.startswith("run folder: runs/")
+    assert "nowhere is not a run folder and not an agent" in said.err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_chosen_folder_that_another_run_has_made_is_replaced(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    chosen = choose_run_folder("A")
+    assert not chosen.exists()
+    assert new_run_folder("A", chosen) == chosen
+    other = new_run_folder("A", chosen)
+    assert other != chosen
+    assert other.is_dir()
+
+
+@pytest.mark.parametrize(("backend", "preset"), [("cpu", "fast"), ("gpu", "gpu"), ("tpu", "gpu")])
+def test_the_default_preset_follows_the_device_and_is_printed(
+    backend, preset, tmp_path, monkeypatch, capsys
+):
+    def stop(config, *rest):
+        assert config == PRESETS[preset]
+        raise ValueError("enough")
+
+    monkeypatch.setattr(jax, "default_backend", lambda: backend)
+    monkeypatch.setattr(runner, "_prepare", stop)
+    assert main(["train", "--out", str(tmp_path / "run")]) == 2
+    lines = capsys.readouterr().out.splitlines()
+    assert lines == [f"run folder: {tmp_path / 'run'}", f"preset: {preset}"]
 
 
 def test_runs_that_start_in_the_same_second_have_folders_of_their_own(tmp_path, monkeypatch):

@@ -13,7 +13,7 @@ from mjx_arm.shard import WHOLE, Shard
 
 
 def epsilon_at(config: ExplorationConfig, env_steps: jax.Array) -> jax.Array:
-    """Share of random actions after a number of environment steps, `[] float32`."""
+    """Epsilon after a number of environment steps, `[] float32`; see `spread_epsilon`."""
     schedule = optax.schedules.linear_schedule(
         config.epsilon_start, config.epsilon_end, config.epsilon_steps
     )
@@ -21,9 +21,10 @@ def epsilon_at(config: ExplorationConfig, env_steps: jax.Array) -> jax.Array:
 
 
 def spread_epsilon(config: ExplorationConfig, epsilon: jax.Array, num_envs: int) -> jax.Array:
-    """The share of each environment, `[num_envs] float32`.
+    """The share of random actions of each environment, `[num_envs] float32`.
 
-    Their mean is `epsilon`, but for those that would be above 1 and are cut to 1.
+    Their mean is `epsilon` as long as none is above 1. Those above 1 are cut to 1, which makes the
+    mean smaller.
     """
     spread = config.epsilon_spread if num_envs > 1 else 1.0
     ratios = np.geomspace(1 / spread, spread, num_envs)

@@ -10,6 +10,7 @@ import sys
 import tyro
 
 from mjx_arm.devices import check_device
+from mjx_arm.envs.tasks import find_task
 from mjx_arm.report.figures import plot_curves
 from mjx_arm.report.progress import make_console
 from mjx_arm.report.run_page import write_report
@@ -35,7 +36,8 @@ class Figures:
         del given
         config = load_config(self.folder)
         seeds = seed_folders(self.folder, config)
-        for path in plot_curves(seeds, into=self.folder):
+        units = find_task(config.env.task).units
+        for path in plot_curves(seeds, into=self.folder, units=units):
             print(path)
         print(write_report(self.folder, config, seeds))
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import pathlib
+from collections.abc import Iterator
 from typing import Annotated
 
 import tyro
@@ -79,18 +80,11 @@ class Train:
         if self.resume is not None:
             self._resume(self.resume, given, console)
             return
-        if self.config is None and is_writer():
-            console.print(f"preset: {self.preset}")
-        out = self.out
-        if self.wandb and out is None:
-            if not alone():
-                raise ValueError("--wandb with several processes needs --out FOLDER")
-            import_wandb()
-            out = new_run_folder(self.options.env.env)
-        with self._log(out) as on_chunk:
+        with self._folder() as out, self._log(out) as on_chunk:
             train(
                 self.options,
                 out,
+                preset=self.preset if self.config is None else None,
                 eval_episodes=self.eval_episodes,
                 stop_at=self.stop_at,
                 init_from=self.init_from,
@@ -98,6 +92,23 @@ class Train:
                 devices=self.devices,
                 console=console,
             )
+
+    @contextlib.contextmanager
+    def _folder(self) -> Iterator[pathlib.Path | None]:
+        """The run folder: as given, or for Weights & Biases, which must know it, a new one."""
+        if self.out is not None or not self.wandb:
+            yield self.out
+            return
+        if not alone():
+            raise ValueError("--wandb with several processes needs --out FOLDER")
+        import_wandb()
+        folder = new_run_folder(self.options.env.env)
+        try:
+            yield folder
+        finally:
+            # A run that is rejected leaves nothing behind; one that has started is not empty.
+            with contextlib.suppress(OSError):
+                folder.rmdir()
 
     def _log(
         self, folder: pathlib.Path | None

@@ -74,13 +74,13 @@ def make_scripted_policy(env: Env) -> Callable[[EnvState], jax.Array]:
         poses, qpos = state.physics.poses, state.physics.qpos
         gripper = poses.site_xpos[arm.grasp_site]
         cube = poses.geom_xpos[task.cube_geom]
-        held = grasped(task, poses, state.ctrl)
+        is_grasped = grasped(task, poses, state.ctrl)
         offset = gripper - cube
         aside = jnp.sqrt(jnp.sum(jnp.square(offset[:2])))
-        target = jnp.where(held, _raised(gripper, radius, top), _above(gripper, cube, aside))
+        target = jnp.where(is_grasped, _raised(gripper, radius, top), _above(gripper, cube, aside))
         joints = state.ctrl[arm.ctrl]
         faces = poses.geom_xmat[task.cube_geom]
-        error = (solve(target, faces, joints, held) - joints) / steps
+        error = (solve(target, faces, joints, is_grasped) - joints) / steps
         away = jnp.abs(error) > _REACHED
         # The furthest joint goes first; now and then they take turns, or two could undo each other
         # for ever.
@@ -95,7 +95,7 @@ def make_scripted_policy(env: Env) -> Callable[[EnvState], jax.Array]:
         missed = closing & (jnp.max(qpos[arm.finger_qpos]) < shut + _MISSED)
         close = (at_cube & reached) | (closing & ~missed)
         grip = jnp.where(missed, arm.open_action, jnp.where(close, arm.close_action, turn))
-        return jnp.where(held, turn, grip).astype(jnp.int32)
+        return jnp.where(is_grasped, turn, grip).astype(jnp.int32)
 
     return policy
 
@@ -211,19 +211,21 @@ def _hinge_rotation(axis: np.ndarray, angle: jax.Array) -> jax.Array:
 def _make_inverse_kinematics(
     arm: Arm, tool: Callable[[jax.Array], tuple[jax.Array, jax.Array]]
 ) -> Callable[[jax.Array, jax.Array, jax.Array, jax.Array], jax.Array]:
-    """Makes `solve(target [3], faces [3, 3], joints [n], held []) -> joints [n]`.
+    """Makes `solve(target [3], faces [3, 3], joints [n], is_grasped []) -> joints [n]`.
 
     Damped least squares: the grasp site at the target, the gripper down, the fingers along the
-    faces of the cube, or where they are if it is held, and the joints near home.
+    faces of the cube, or where they are if it is grasped, and the joints near home.
     """
     home = jnp.asarray(arm.home_qpos[arm.qpos])
     low, high = arm.ctrl_range[arm.ctrl].T
     weights = jnp.asarray([1.0, _DIRECTION, _DIRECTION], jnp.float32)[:, None]
     pull = np.float32(_PULL)
 
-    def solve(target: jax.Array, faces: jax.Array, joints: jax.Array, held: jax.Array) -> jax.Array:
+    def solve(
+        target: jax.Array, faces: jax.Array, joints: jax.Array, is_grasped: jax.Array
+    ) -> jax.Array:
         down = jnp.asarray([0.0, 0.0, -1.0], jnp.float32)
-        across = _finger_direction(tool(joints)[0][2], faces, held)
+        across = _finger_direction(tool(joints)[0][2], faces, is_grasped)
         wanted = jnp.stack([target, down, across])
 
         def improve(_: int, joints: jax.Array) -> jax.Array:
@@ -240,14 +242,14 @@ def _make_inverse_kinematics(
     return solve
 
 
-def _finger_direction(across: jax.Array, faces: jax.Array, held: jax.Array) -> jax.Array:
+def _finger_direction(across: jax.Array, faces: jax.Array, is_grasped: jax.Array) -> jax.Array:
     """The horizontal direction nearest to `across` that is normal to a face of the cube."""
     heading = jnp.arctan2(across[1], across[0])
     # The edge of the cube that lies flattest; a cube can be on any of its faces.
     edge = faces[:, jnp.argmin(jnp.abs(faces[2]))]
     quarter = np.float32(np.pi / 2)
     turn = jnp.mod(jnp.arctan2(edge[1], edge[0]) - heading + quarter / 2, quarter) - quarter / 2
-    heading = heading + jnp.where(held, jnp.zeros_like(turn), turn)
+    heading = heading + jnp.where(is_grasped, jnp.zeros_like(turn), turn)
     return jnp.stack([jnp.cos(heading), jnp.sin(heading), jnp.zeros_like(heading)])
 
 

@@ -7,7 +7,7 @@ import io
 import itertools
 import pathlib
 from collections.abc import Mapping, Sequence
-from typing import Literal
+from typing import Any, Literal
 
 import matplotlib
 import numpy as np
@@ -34,12 +34,14 @@ class _Panel:
       unit: of the vertical axis.
       column: of the metrics.
       dots: a second column, drawn as dots, and its name in the legend.
+      of_steps: it is counted in steps, and not in episodes that have ended.
     """
 
     title: str
     unit: str
     column: str
     dots: tuple[str, str] | None = None
+    of_steps: bool = False
 
 
 _PAPER = (
@@ -55,7 +57,9 @@ _LEARNING = (
 )
 
 
-def plot_curves(folders: Sequence[pathlib.Path], into: pathlib.Path) -> list[pathlib.Path]:
+def plot_curves(
+    folders: Sequence[pathlib.Path], into: pathlib.Path, *, units: Mapping[str, str]
+) -> list[pathlib.Path]:
     """Draws the curves of run folders as PNG files.
 
     `figure3.png` has the paper's three: cumulative successes, mean reward of a step and mean
@@ -67,6 +71,7 @@ def plot_curves(folders: Sequence[pathlib.Path], into: pathlib.Path) -> list[pat
     Args:
       folders: with metrics.
       into: where the files go.
+      units: of the task's metrics; see `mjx_arm.register`.
 
     Returns:
       Paths of the files.
@@ -77,15 +82,18 @@ def plot_curves(folders: Sequence[pathlib.Path], into: pathlib.Path) -> list[pat
     runs, names = _read_runs(folders)
     return [
         _draw(into / "figure3.png", _PAPER, "episode", runs, names),
-        _draw(into / "learning.png", _learning_panels(runs[0]), "env_steps", runs, names),
+        _draw(into / "learning.png", _learning_panels(runs[0], units), "env_steps", runs, names),
     ]
 
 
-def draw_panels(folders: Sequence[pathlib.Path]) -> list[tuple[str, bytes]]:
+def draw_panels(
+    folders: Sequence[pathlib.Path], *, units: Mapping[str, str]
+) -> list[tuple[str, bytes]]:
     """Draws each curve of `plot_curves` as an SVG picture of its own.
 
     Args:
       folders: with metrics.
+      units: of the task's metrics; see `mjx_arm.register`.
 
     Returns:
       The title and the content of each picture: those of `learning.png`, then of `figure3.png`.
@@ -94,16 +102,19 @@ def draw_panels(folders: Sequence[pathlib.Path]) -> list[tuple[str, bytes]]:
       ValueError: a folder holds no metrics.
     """
     runs, names = _read_runs(folders)
-    panels = [(panel, "env_steps") for panel in _learning_panels(runs[0])]
+    panels = [(panel, "env_steps") for panel in _learning_panels(runs[0], units)]
     panels += [(panel, "episode") for panel in _PAPER]
     return [(panel.title, _draw_svg(panel, x_name, runs, names)) for panel, x_name in panels]
 
 
-def draw_groups(groups: Mapping[str, Sequence[pathlib.Path]]) -> list[tuple[str, bytes]]:
+def draw_groups(
+    groups: Mapping[str, Sequence[pathlib.Path]], *, units: Mapping[str, str]
+) -> list[tuple[str, bytes]]:
     """Draws the curves of several runs in one picture each, as `draw_panels` does.
 
     Args:
       groups: names of the runs, and the folders of their seeds, with metrics.
+      units: of the metrics of their tasks; see `mjx_arm.register`.
 
     Returns:
       The title and the content of each picture.
@@ -115,7 +126,7 @@ def draw_groups(groups: Mapping[str, Sequence[pathlib.Path]]) -> list[tuple[str,
     # Runs of different tasks have different metrics; each picture shows the runs that have it.
     panels: dict[_Panel, str] = {}
     for seeds in runs.values():
-        panels |= dict.fromkeys(_learning_panels(seeds[0]), "env_steps")
+        panels |= dict.fromkeys(_learning_panels(seeds[0], units), "env_steps")
     panels |= dict.fromkeys(_PAPER, "episode")
     pictures = []
     for panel, x_name in panels.items():
@@ -161,26 +172,27 @@ def _read_runs(
     return [_columns(folder) for folder in folders], [folder.name for folder in folders]
 
 
-def _learning_panels(columns: dict[str, np.ndarray]) -> list[_Panel]:
+def _learning_panels(columns: Mapping[str, np.ndarray], units: Mapping[str, str]) -> list[_Panel]:
     # A user's own algorithm need not have a loss.
     known = [panel for panel in _LEARNING if panel.column in columns]
-    return known + _task_panels(columns)
+    return known + _task_panels(columns, units)
 
 
-def _task_panels(columns: dict[str, np.ndarray]) -> list[_Panel]:
+def _task_panels(columns: Mapping[str, np.ndarray], units: Mapping[str, str]) -> list[_Panel]:
     """Panels for the metrics of a task: shares of steps, and means."""
     known = {"mean_reward", "mean_max_q", "mean_length", "blocked_share"}
     panels = []
-    for name in columns:
-        if name in known:
+    for column in columns:
+        if column in known:
             continue
-        if name.endswith("_share"):
-            title = name.removesuffix("_share").replace("_", " ")
-            panels.append(_Panel(title, "share of steps", name))
-        elif name.startswith("mean_"):
-            title = f"mean {name.removeprefix('mean_').replace('_', ' ')}"
-            unit = "m" if any(word in name for word in ("distance", "height")) else "mean of a step"
-            panels.append(_Panel(title, unit, name))
+        if column.endswith("_share"):
+            name, title, unit = column.removesuffix("_share"), "", "share of steps"
+        elif column.startswith("mean_"):
+            name, title = column.removeprefix("mean_"), "mean "
+            unit = units.get(name, "mean of a step")
+        else:
+            continue
+        panels.append(_Panel(title + name.replace("_", " "), unit, column, of_steps=True))
     return panels
 
 
@@ -241,8 +253,10 @@ def _draw_panel(
         x, y = _known(run, x_name, panel.column)
         empty &= x.size == 0
         few = x.size < 30
-        axes.plot(x, y, color=colour, lw=0.8, alpha=0.35, marker="." if few else "")
-        axes.plot(x, smooth(y), color=colour, lw=1.6, label=name if len(runs) > 1 else "training")
+        raw, smoothed = ("raw", "smoothed") if len(runs) == 1 else (None, name)
+        thin: dict[str, Any] = {"lw": 0.8, "alpha": 0.35, "marker": "." if few else ""}
+        axes.plot(x, y, color=colour, label=raw, **thin)
+        axes.plot(x, smooth(y), color=colour, lw=1.6, label=smoothed)
         if panel.dots is not None:
             x, y = _known(run, x_name, panel.dots[0])
             label = panel.dots[1] if run is runs[0] and x.size else None
@@ -252,7 +266,7 @@ def _draw_panel(
         _draw_spread(axes, panel.column, x_name, runs)
     if empty:
         axes.text(0.5, 0.5, _why_empty(panel), transform=axes.transAxes, ha="center", va="center")
-    _finish(axes, panel, x_name, legend=(len(runs) > 1 or panel.dots is not None) and not empty)
+    _finish(axes, panel, x_name, legend=not empty)
 
 
 def _finish(axes: Axes, panel: _Panel, x_name: str, *, legend: bool) -> None:
@@ -323,6 +337,6 @@ def smooth(values: np.ndarray) -> np.ndarray:
 def _why_empty(panel: _Panel) -> str:
     if panel.column == "loss":
         return "no update yet"
-    if panel.unit in ("share of steps", "m", "mean of a step"):
+    if panel.of_steps:
         return "no step yet"
     return "no episode has ended yet"

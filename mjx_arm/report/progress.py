@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import codecs
+import contextlib
 import math
 import pathlib
 import shutil
 import sys
+import threading
 import time
+from collections.abc import Iterator
 from types import TracebackType
 from typing import Any, Self
 
@@ -16,6 +19,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 
 _SECONDS_BETWEEN_LINES = 30.0
+_TRAINING = "training"
 # Episodes that the shown success rate averages over, and chunks that the speed does.
 _EPISODES = 200.0
 _CHUNKS = 10.0
@@ -75,23 +79,110 @@ def say_working_memory(console: Console, plan: dict[str, int]) -> None:
     console.print(f"memory: {working:.1f} MB more to work in; {total:.1f} MB in all")
 
 
+class Heartbeat:
+    """Says that a run is alive: a line after each 30 seconds without one, from a thread.
+
+    The line names the phase and its time. In a terminal and on a quiet console nothing is printed.
+    Nothing is printed after the end of the `with` block.
+
+    Args:
+      console: where it prints.
+      phase: what is being done, such as `compiling`.
+      seconds: between two lines.
+    """
+
+    def __init__(self, console: Console, phase: str, seconds: float = _SECONDS_BETWEEN_LINES):
+        self._console, self._phase, self._seconds = console, phase, seconds
+        self._began = self._last = time.monotonic()
+        self._lock = threading.Lock()
+        self._ended = threading.Event()
+        # A daemon, so that an end of the process without the end of the block does not wait for it.
+        self._thread = threading.Thread(target=self._beat, name="heartbeat", daemon=True)
+
+    def __enter__(self) -> Self:
+        if not self._console.is_terminal and not self._console.quiet:
+            self._thread.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._ended.set()
+        if self._thread.is_alive():
+            self._thread.join()
+
+    def begin(self, phase: str) -> None:
+        """Another phase begins now."""
+        with self._lock:
+            self._phase, self._began = phase, time.monotonic()
+
+    def say(self, line: str) -> None:
+        """Prints a line, and waits again before the next one."""
+        with self._lock:
+            self._last = time.monotonic()
+            self._console.print(line, soft_wrap=True)
+
+    def _beat(self) -> None:
+        # The main thread meets the errors of its own output; this one ends without a word.
+        with contextlib.suppress(OSError):
+            while not self._ended.wait(max(self._last + self._seconds - time.monotonic(), 0.0)):
+                with self._lock:
+                    now = time.monotonic()
+                    if now - self._last < self._seconds or self._ended.is_set():
+                        continue
+                    self._last = now
+                    text = f"{self._phase}, {_minutes(now - self._began)} so far"
+                    self._console.print(text, soft_wrap=True)
+
+
+@contextlib.contextmanager
+def phase(
+    console: Console, name: str, note: str = "", *, seconds: float = _SECONDS_BETWEEN_LINES
+) -> Iterator[None]:
+    """Prints what is being done, and again while it lasts; see `Heartbeat`.
+
+    Args:
+      console: where it prints.
+      name: what is being done.
+      note: more about it, for the first line.
+      seconds: between two lines.
+    """
+    console.print(f"{name}: {note}" if note else name, soft_wrap=True)
+    with Heartbeat(console, name, seconds):
+        yield
+
+
 class RunProgress:
     """The progress of a training run: a bar in a terminal, plain lines anywhere else.
 
-    Without a terminal (a pipe, a scheduler's log) it prints a line at least every 30 seconds, as
-    soon as a chunk has ended.
+    Without a terminal (a pipe, a scheduler's log) it prints a line at least every 30 seconds: about
+    a chunk that has ended, or where a chunk takes longer, the phase and its time.
 
     Args:
       console: where it prints.
       total: environment steps of the whole run.
       done: environment steps that were made before.
+      seconds: between two lines.
     """
 
-    def __init__(self, console: Console, total: int, done: int = 0):
+    def __init__(
+        self,
+        console: Console,
+        total: int,
+        done: int = 0,
+        *,
+        seconds: float = _SECONDS_BETWEEN_LINES,
+    ):
         self._console, self._total, self._done = console, total, done
+        self._seconds = seconds
         self._success = _Smoothed(_EPISODES)
         self._speed = _Smoothed(_CHUNKS)
         self._last_line = -math.inf
+        self._last_update = time.monotonic()
+        self._heartbeat = Heartbeat(console, _TRAINING, seconds)
         self._bar = Progress(
             TextColumn("{task.completed:,.0f} of {task.total:,.0f} ({task.percentage:.0f} %)"),
             BarColumn(bar_width=10),
@@ -103,6 +194,7 @@ class RunProgress:
 
     def __enter__(self) -> Self:
         self._bar.start()
+        self._heartbeat.__enter__()
         return self
 
     def __exit__(
@@ -111,6 +203,7 @@ class RunProgress:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
+        self._heartbeat.__exit__(kind, error, trace)
         self._bar.stop()
 
     def update(self, completed: int, rows: list[dict[str, float]]) -> None:
@@ -126,20 +219,23 @@ class RunProgress:
         left = (self._total - completed) * self._speed.mean
         text = self._describe(metrics, left)
         self._bar.update(self._task, completed=completed, metrics=text)
+        self._heartbeat.begin(_TRAINING)
         now = time.monotonic()
-        due = now - self._last_line >= _SECONDS_BETWEEN_LINES or completed >= self._total
+        # The next chunk may end too late.
+        next_update = now + (now - self._last_update)
+        self._last_update = now
+        due = next_update - self._last_line > self._seconds or completed >= self._total
         if not self._console.is_terminal and due:
             self._last_line = now
             share = 100 * completed / self._total
-            self._console.print(
-                f"{completed:,} of {self._total:,} steps ({share:.0f} %), {text}", soft_wrap=True
-            )
+            self._heartbeat.say(f"{completed:,} of {self._total:,} steps ({share:.0f} %), {text}")
 
     def phase(self, name: str) -> None:
         """Says what is being done between two chunks."""
         self._bar.update(self._task, metrics=name)
+        self._heartbeat.begin(name)
         if not self._console.is_terminal:
-            self._console.print(name, soft_wrap=True)
+            self._heartbeat.say(name)
 
     def _describe(self, metrics: dict[str, float], seconds_left: float) -> str:
         parts = [f"{metrics['steps_per_s']:,.0f} steps/s"]

@@ -11,6 +11,7 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 from mjx_arm.config import TrainConfig, set_train_options
+from mjx_arm.envs.tasks import find_task
 from mjx_arm.report import html
 from mjx_arm.report.figures import draw_panels
 from mjx_arm.report.metrics import read_metrics
@@ -55,7 +56,7 @@ def write_report(
         *(_of_one_seed(folder) if len(seeds) == 1 else _of_seeds(folder, seeds)),
         "<h2>Curves</h2>",
         f'<p class="quiet">{_legend(len(seeds))}</p>',
-        html.pictures(draw_panels(seeds)),
+        html.pictures(draw_panels(seeds, units=find_task(config.env.task).units)),
         *(_evaluation_section(folder) if len(seeds) == 1 else ()),
         "<h2>Configuration</h2>",
         '<p class="quiet">Bold options differ from the default of <code>mjx-arm train</code> '

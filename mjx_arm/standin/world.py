@@ -246,9 +246,9 @@ class StandIn:
         cube = poses.geom_xpos[task.cube_geom]
         offset = poses.site_xpos[self.env.arm.grasp_site] - cube
         height = float(cube[2] - np.float32(task.half_size))
-        held = bool(self._grasps(poses, self.ctrl)) and not self.diverged
-        success = held and height >= task.config.lift
-        return Measured(float(np.linalg.norm(offset)), height, held, success)
+        is_grasped = bool(self._grasps(poses, self.ctrl)) and not self.diverged
+        success = is_grasped and height >= task.config.lift
+        return Measured(float(np.linalg.norm(offset)), height, is_grasped, success)
 
     def close(self) -> None:
         """Frees the OpenGL context."""

@@ -12,6 +12,7 @@ import numpy as np
 from scipy.stats import t as student_t
 
 from mjx_arm.config import TrainConfig
+from mjx_arm.envs.tasks import find_task
 from mjx_arm.options import flat_names, get_option
 from mjx_arm.report import html
 from mjx_arm.report.figures import draw_groups
@@ -284,7 +285,11 @@ def _page(results: Sequence[RunResult]) -> Iterator[str]:
         "they are the mean, and the band reaches from the least to the largest seed. Diamonds are "
         "held-out episodes.</p>"
     )
-    yield html.pictures(draw_groups({result.name: result.folders for result in results}))
+    units: dict[str, str] = {}
+    for result in results:
+        units |= find_task(result.config.env.task).units
+    groups = {result.name: result.folders for result in results}
+    yield html.pictures(draw_groups(groups, units=units))
     options = different_options(results)
     if options:
         yield "<h2>Options that differ</h2>"

@@ -7,13 +7,14 @@ import importlib
 import json
 import math
 import pathlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from rich.console import Console
 
 from mjx_arm.config import TrainConfig, dump_config, set_train_options
+from mjx_arm.envs.tasks import find_task
 from mjx_arm.options import Count, Positive, check_value
 from mjx_arm.report import html
 from mjx_arm.report.figures import draw_groups
@@ -100,7 +101,10 @@ def sweep(
     if left > 0:
         study.optimize(objective, left, timeout=None if minutes is None else 60 * minutes)
     ranked = _rank(study, folder)
-    html.write_page(folder / _PAGE, html.document("Sweep: mjx_arm", _page(ranked, space)))
+    html.write_page(
+        folder / _PAGE,
+        html.document("Sweep: mjx_arm", _page(ranked, space, find_task(config.env.task).units)),
+    )
     return ranked
 
 
@@ -250,7 +254,9 @@ def _shown(value: Any) -> str:
     return f"{value:.3g}" if isinstance(value, float) else str(value)
 
 
-def _page(trials: Sequence[Trial], space: Sequence[Dimension]) -> Iterator[str]:
+def _page(
+    trials: Sequence[Trial], space: Sequence[Dimension], units: Mapping[str, str]
+) -> Iterator[str]:
     head, *rows = _table(trials, space)
     yield "<h1>Sweep</h1>"
     complete, pruned = (
@@ -269,7 +275,7 @@ def _page(trials: Sequence[Trial], space: Sequence[Dimension]) -> Iterator[str]:
             groups[trial.folder.name] = folders
     if groups:
         yield f"<h2>Curves of the best {len(groups)}</h2>"
-        yield html.pictures(draw_groups(groups))
+        yield html.pictures(draw_groups(groups, units=units))
     yield "<footer>This page is one file. It opens without a network.</footer>"
 
 

@@ -34,7 +34,7 @@ _MANIFEST = "manifest.json"
 _STATE = "state"
 # What orbax writes beside the arrays, bytes.
 _OVERHEAD = 4_000_000
-# Options that may change while a run goes on.
+# Options that may change when a run is resumed.
 _FREE = ("total_steps",)
 
 

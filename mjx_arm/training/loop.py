@@ -186,7 +186,13 @@ def _seed_specs(mesh: Mesh | None) -> Any:
 
 
 def make_train(
-    config: TrainConfig, *, mesh: Mesh | None = None, **parts: Any
+    config: TrainConfig,
+    *,
+    mesh: Mesh | None = None,
+    env: Env | None = None,
+    network: Any = None,
+    reward: Reward | None = None,
+    algorithm: Callable[..., Algorithm] | None = None,
 ) -> Callable[[jax.Array], tuple[LoopState, Counts]]:
     """Makes a whole training run as one function, for use from Python.
 
@@ -197,7 +203,10 @@ def make_train(
       mesh: devices that share the environments, the replay and each batch, along its one axis. To
         give each device some of the seeds instead, leave it out and call `jax.shard_map` with
         `jax.vmap(train)`, keys and results split along the axis, and `check_vma=False`.
-      **parts: `env`, `network`, `reward` or `algorithm`, as in `make_trainer`.
+      env: as in `make_trainer`.
+      network: as in `make_trainer`.
+      reward: as in `make_trainer`.
+      algorithm: as in `make_trainer`.
 
     Returns:
       `train(key) -> (state, counts)`: the state after the last step, and the counts of each chunk,
@@ -207,7 +216,9 @@ def make_train(
       ValueError: the environment cannot be made, or the mesh does not divide the work.
     """
     config, shard = dataclasses.replace(config, num_seeds=1), shard_of(mesh)
-    body = make_body(config, **parts, shard=shard)
+    body = make_body(
+        config, env=env, network=network, reward=reward, algorithm=algorithm, shard=shard
+    )
 
     def train(key: jax.Array) -> tuple[LoopState, Counts]:
         return jax.lax.scan(

@@ -42,7 +42,12 @@ def _on_one_device(tree: Any) -> Any:
 def working_memory(compiled: jax.stages.Compiled, physics: Physics, simulations: int) -> int:
     """Bytes that a compiled program needs beside its arguments and results while it runs.
 
-    Those of so many simulations on the host count where that is the device.
+    Where the device is the host, the memory of a number of simulations in MuJoCo counts too.
+
+    Args:
+      compiled: the program.
+      physics: what it simulates with.
+      simulations: number of simulations side by side.
     """
     host = physics.host_memory(simulations) if jax.default_backend() == "cpu" else 0
     analysis = compiled.memory_analysis()

@@ -24,6 +24,7 @@ from mjx_arm.training.seal import is_sealed, seal
 CONFIG = "config.json"
 EVALUATION = "evaluation.json"
 _LOCK = ".lock"
+_RUNS = pathlib.Path("runs")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -175,23 +176,35 @@ def locked(folder: pathlib.Path) -> Iterator[None]:
         lock.release()
 
 
-def new_run_folder(name: str) -> pathlib.Path:
-    """Makes a folder in `runs`, named by the time, and with a number where that name is taken.
+def choose_run_folder(name: str) -> pathlib.Path:
+    """A free path in `runs`, named by the time, and with a number where that name is taken."""
+    stem = f"{datetime.datetime.now():%Y-%m-%d-%H%M%S}-{name}"
+    folder, number = _RUNS / stem, 1
+    while folder.exists():
+        number += 1
+        folder = _RUNS / f"{stem}-{number}"
+    return folder
+
+
+def new_run_folder(name: str, folder: pathlib.Path | None = None) -> pathlib.Path:
+    """Makes a folder in `runs`; see `choose_run_folder`.
+
+    Args:
+      name: the end of the folder's name.
+      folder: the path that was chosen. If another process has made it since, another is chosen.
 
     Raises:
       ValueError: it cannot be made.
     """
-    runs, stem = pathlib.Path("runs"), f"{datetime.datetime.now():%Y-%m-%d-%H%M%S}-{name}"
-    folder, number = runs / stem, 1
+    folder = choose_run_folder(name) if folder is None else folder
     try:
-        runs.mkdir(exist_ok=True)
+        _RUNS.mkdir(exist_ok=True)
         while True:
             # Not `exist_ok`: runs that a cluster starts in one second must not share a folder.
             with contextlib.suppress(FileExistsError):
                 folder.mkdir()
                 return folder
-            number += 1
-            folder = runs / f"{stem}-{number}"
+            folder = choose_run_folder(name)
     except OSError as error:
         raise _cannot_be_made(folder, error) from error
 
@@ -200,16 +213,17 @@ def _cannot_be_made(folder: pathlib.Path, error: OSError) -> ValueError:
     return ValueError(f"{folder} cannot be made ({error.strerror}): give --out another folder")
 
 
-def prepare_folder(folder: pathlib.Path) -> pathlib.Path:
-    """Makes the run folder, and returns it.
+def check_folder(folder: pathlib.Path) -> None:
+    """Checks that a run can be written to a path, and makes nothing.
 
     Raises:
       ValueError: it is a file, holds something already, or cannot be written.
     """
     try:
-        folder.mkdir(parents=True, exist_ok=True)
         occupied = any(path.name != _LOCK for path in folder.iterdir())
-    except (FileExistsError, NotADirectoryError) as error:
+    except FileNotFoundError:
+        return
+    except NotADirectoryError as error:
         raise ValueError(f"{folder} is a file: give --out a new or empty folder") from error
     except OSError as error:
         raise _cannot_be_made(folder, error) from error
@@ -217,6 +231,21 @@ def prepare_folder(folder: pathlib.Path) -> pathlib.Path:
         raise ValueError(f"{folder} cannot be written: give --out another folder")
     if occupied:
         raise ValueError(f"{folder} is not empty: give --out a new or empty folder")
+
+
+def prepare_folder(folder: pathlib.Path) -> pathlib.Path:
+    """Makes the run folder, and returns it.
+
+    Raises:
+      ValueError: see `check_folder`, or it cannot be made.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except (FileExistsError, NotADirectoryError) as error:
+        raise ValueError(f"{folder} is a file: give --out a new or empty folder") from error
+    except OSError as error:
+        raise _cannot_be_made(folder, error) from error
+    check_folder(folder)
     return folder
 
 

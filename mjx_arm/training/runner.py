@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import json
 import math
 import os
@@ -15,7 +16,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from types import FrameType, TracebackType
-from typing import Any, Self
+from typing import Any, ParamSpec, Self, TypeVar
 
 import flax.traverse_util
 import jax
@@ -26,12 +27,14 @@ from mjx_arm.algos.collect import Counts
 from mjx_arm.config import TrainConfig, advice, set_train_options
 from mjx_arm.devices import check_device
 from mjx_arm.envs.env import make_env
+from mjx_arm.envs.tasks import find_task
 from mjx_arm.options import Count, Discount, Positive, check_value
 from mjx_arm.report.figures import plot_curves
 from mjx_arm.report.metrics import MetricsWriter, keep_metrics, last_env_steps, last_wall_s
 from mjx_arm.report.progress import (
     RunProgress,
     make_console,
+    phase,
     say_device,
     say_memory,
     say_mesh,
@@ -76,7 +79,9 @@ from mjx_arm.training.processes import any_says, is_writer, on_writer, wait_for_
 from mjx_arm.training.run_folder import (
     EVALUATION,
     SavedRun,
+    check_folder,
     check_untouched,
+    choose_run_folder,
     load_run,
     locked,
     new_run_folder,
@@ -91,6 +96,8 @@ from mjx_arm.training.run_folder import (
 _SELECTION_SEED = 2_000_003
 _EVALUATION_SEED = 1_000_003
 _EVALUATION_EPSILON = 0.1
+P = ParamSpec("P")
+R = TypeVar("R")
 Evaluate = Callable[[Any], Evaluation]
 RunChunk = Callable[[LoopState], tuple[LoopState, Counts]]
 # Called between two chunks with the metrics of each seed and the state.
@@ -115,10 +122,23 @@ class RunInterruptedError(Exception):
     """The user asked a run to stop; its state is saved."""
 
 
+def _with_rank_promotion(function: Callable[P, R]) -> Callable[P, R]:
+    """Allows rank promotion: JAX_NUMPY_RANK_PROMOTION is meant for the user's own programs."""
+
+    @functools.wraps(function)
+    def run(*args: P.args, **options: P.kwargs) -> R:
+        with jax.numpy_rank_promotion("allow"):
+            return function(*args, **options)
+
+    return run
+
+
+@_with_rank_promotion
 def train(
     config: TrainConfig,
     folder: str | pathlib.Path | None = None,
     *,
+    preset: str | None = None,
     eval_episodes: int = 200,
     stop_at: float | None = None,
     minutes: float | None = None,
@@ -141,6 +161,7 @@ def train(
       config: the options.
       folder: the run folder; made, must be new or empty. None for a new one in `runs`, named by
         the time.
+      preset: name of the preset that the options come from, which is then printed.
       eval_episodes: episodes of the evaluation at the end.
       stop_at: end the run when a selection has reached this success rate for every seed.
       minutes: end the run after the first chunk that ends later than this; compiling and the
@@ -167,30 +188,37 @@ def train(
     _check_options(eval_episodes, stop_at, minutes)
     console = _own_console(console)
     objects = Objects(env=env, network=network, reward=reward, algorithm=algorithm)
+    name = config.env.env if env is None else env.config.env
+    chosen = pathlib.Path(on_writer(lambda: str(_choose_folder(name, folder))))
+    console.print(f"run folder: {chosen}", soft_wrap=True)
+    if preset is not None:
+        console.print(f"preset: {preset}")
     trainer = _prepare(config, objects, console, devices)
     config = trainer.config
     recorded = record(config, objects)
     for sentence in only_here(recorded):
         console.print(f"[yellow]warning: {sentence}[/yellow]", soft_wrap=True)
     start = None if init_from is None else _read_policy(trainer, pathlib.Path(init_from))
-    made = pathlib.Path(on_writer(lambda: str(_make_folder(config, folder))))
-    folder = made
-    with _locked(folder):
-        console.print(f"run folder: {folder}", soft_wrap=True)
+    made = pathlib.Path(on_writer(lambda: str(_make_folder(name, folder, chosen))))
+    if made != chosen:
+        console.print(f"run folder: {made}; another run has taken {chosen}", soft_wrap=True)
+    with _locked(made):
         run_chunk = _compile(trainer, console)
-        state = trainer.start()
+        with phase(console, "starting the environments"):
+            state = trainer.start()
         if start is not None:
             learner = trainer.algorithm.with_policy(state.learner, start)
             state = place(dataclasses.replace(state, learner=learner), trainer.shapes())
         run = SavedRun(_with_backend(config, trainer), recorded, trainer.env.scene.source)
         on_writer(lambda: save_run(made, run))
-        loop = _Loop(trainer, run, run_chunk, folder, console, stop_at, minutes, on_chunk)
+        loop = _Loop(trainer, run, run_chunk, made, console, stop_at, minutes, on_chunk)
         console.print(f"training: {config.total_steps:,} environment steps")
         loop.run(state, 0)
         ending = _Ending(eval_episodes, console, _local_devices(trainer), video)
-        return _finish_on_writer(folder, run, objects, ending)
+        return _finish_on_writer(made, run, objects, ending)
 
 
+@_with_rank_promotion
 def resume(
     folder: str | pathlib.Path,
     *,
@@ -260,7 +288,8 @@ def resume(
             )
         # Before the state is allocated, or the memory check would count it twice.
         run_chunk = _compile(trainer, console)
-        state = checkpoints.load(vector_step, shapes) if found else trainer.start()
+        with phase(console, "reading the checkpoint" if found else "starting the environments"):
+            state = checkpoints.load(vector_step, shapes) if found else trainer.start()
         run = dataclasses.replace(saved, config=config)
         on_writer(lambda: _continue_files(folder, run, saved, done))
         console.print(f"resuming after {done:,} steps")
@@ -277,10 +306,20 @@ def _own_console(console: Console | None) -> Console:
     return make_console() if console is None else console
 
 
-def _make_folder(config: TrainConfig, folder: str | pathlib.Path | None) -> pathlib.Path:
+def _choose_folder(name: str, folder: str | pathlib.Path | None) -> pathlib.Path:
+    """The path of the run folder, which nobody has made yet."""
     if folder is None:
-        return new_run_folder(config.env.env)
-    return prepare_folder(pathlib.Path(folder))
+        return choose_run_folder(name)
+    check_folder(pathlib.Path(folder))
+    return pathlib.Path(folder)
+
+
+def _make_folder(
+    name: str, folder: str | pathlib.Path | None, chosen: pathlib.Path
+) -> pathlib.Path:
+    if folder is None:
+        return new_run_folder(name, chosen)
+    return prepare_folder(chosen)
 
 
 @contextlib.contextmanager
@@ -423,9 +462,9 @@ def _local_devices(trainer: Trainer) -> int:
 
 def _compile(trainer: Trainer, console: Console) -> RunChunk:
     """The compiled chunk; refused where what it needs to work in does not fit beside the state."""
-    console.print("compiling: about half a minute")
     shapes = trainer.shapes()
-    compiled = trainer.run_chunk.lower(shapes).compile()
+    with phase(console, "compiling", "about a minute"):
+        compiled = trainer.run_chunk.lower(shapes).compile()
     devices = 1 if trainer.mesh is None else trainer.mesh.size
     simulations = trainer.config.num_seeds * trainer.config.num_envs // devices
     working = working_memory(compiled, trainer.env.physics, simulations)
@@ -727,42 +766,53 @@ def _finish(
     ending: _Ending,
     mesh: jax.sharding.Mesh | None,
 ) -> list[Evaluation]:
-    folders = seed_folders(folder, run.config)
+    folders, console = seed_folders(folder, run.config), ending.console
     if len(folders) > 1:
-        for path in plot_curves(folders, into=folder):
-            ending.console.print(f"curves: {path}", soft_wrap=True)
-    results = [_finish_seed(own, objects, ending, mesh) for own in folders]
-    if len(folders) > 1:
-        for own, config in zip(folders, seed_configs(run.config), strict=True):
-            write_report(own, config, [own])
-    report = write_report(folder, run.config, folders)
-    ending.console.print(f"report: {report}", soft_wrap=True)
+        _draw_curves(folders, folder, run.config, console)
+    results = []
+    for own in folders:
+        _draw_curves([own], own, run.config, console)
+        results.append(_evaluate_seed(own, objects, ending, mesh))
+    with phase(console, "writing the report"):
+        if len(folders) > 1:
+            for own, config in zip(folders, seed_configs(run.config), strict=True):
+                write_report(own, config, [own])
+        report = write_report(folder, run.config, folders)
+    console.print(f"report: {report}", soft_wrap=True)
     return results
 
 
-def _finish_seed(
+def _draw_curves(
+    folders: list[pathlib.Path], into: pathlib.Path, config: TrainConfig, console: Console
+) -> None:
+    with phase(console, "drawing the curves"):
+        paths = plot_curves(folders, into=into, units=find_task(config.env.task).units)
+    for path in paths:
+        console.print(f"curves: {path}", soft_wrap=True)
+
+
+def _evaluate_seed(
     folder: pathlib.Path,
     objects: Objects,
     ending: _Ending,
     mesh: jax.sharding.Mesh | None,
 ) -> Evaluation:
     console = ending.console
-    for path in plot_curves([folder], into=folder):
-        console.print(f"curves: {path}", soft_wrap=True)
-    console.print(f"evaluating: {ending.eval_episodes} episodes")
-    scene = None if objects.env is not None else STORED
-    agent = load_agent(folder, scene=scene, **objects.given())
-    console.print(f"agent: {find_agent(folder)}, after {agent.env_steps:,} steps", soft_wrap=True)
     key = role_key(_EVALUATION_SEED, EVALUATION_ROLE)
-    result = evaluate(
-        agent.env,
-        agent.apply,
-        agent.params,
-        episodes=ending.eval_episodes,
-        epsilon=_EVALUATION_EPSILON,
-        key=key,
-        mesh=mesh,
-    )
+    with phase(console, "evaluating", f"{ending.eval_episodes} episodes"):
+        scene = None if objects.env is not None else STORED
+        agent = load_agent(folder, scene=scene, **objects.given())
+        said = f"agent: {find_agent(folder)}, after {agent.env_steps:,} steps"
+        console.print(said, soft_wrap=True)
+        result = evaluate(
+            agent.env,
+            agent.apply,
+            agent.params,
+            episodes=ending.eval_episodes,
+            epsilon=_EVALUATION_EPSILON,
+            key=key,
+            mesh=mesh,
+        )
     (folder / EVALUATION).write_text(json.dumps(dataclasses.asdict(result)) + "\n")
     add_evaluation(find_agent(folder), dataclasses.asdict(result))
     low, high = result.ci95
@@ -772,12 +822,12 @@ def _finish_seed(
     )
     if not ending.video:
         return result
-    console.print("rendering a video")
-    episode = record_episode(
-        agent.env, agent.apply, agent.params, epsilon=_EVALUATION_EPSILON, key=key
-    )
     path = folder / "policy.mp4"
-    write_video(path, draw_episode(agent.env, episode))
+    with phase(console, "rendering a video"):
+        episode = record_episode(
+            agent.env, agent.apply, agent.params, epsilon=_EVALUATION_EPSILON, key=key
+        )
+        write_video(path, draw_episode(agent.env, episode))
     console.print(
         f"video: {path} ({len(episode)} frames, success: {episode.success})", soft_wrap=True
     )

@@ -13,7 +13,7 @@ from mjx_arm.algos.exploration import (
     epsilon_greedy,
     spread_epsilon,
 )
-from mjx_arm.config import ExplorationConfig
+from mjx_arm.config import ExplorationConfig, TrainConfig
 
 
 def test_epsilon_is_the_share_of_random_actions():
@@ -54,6 +54,17 @@ def test_the_mean_over_environments_is_epsilon(num_envs, spread):
     for epsilon in (0.1, 0.3):
         shares = spread_epsilon(config, jnp.float32(epsilon), num_envs)
         assert float(shares.mean()) == pytest.approx(epsilon, rel=1e-5)
+
+
+@pytest.mark.parametrize(("epsilon", "mean"), [(1.0, 0.68), (0.1, 0.1)])
+def test_the_mean_share_of_the_defaults_is_as_documented(epsilon, mean):
+    """Shares above 1 are cut, so that the mean is below epsilon at the beginning."""
+    config = TrainConfig()
+    ends = (config.exploration.epsilon_start, config.exploration.epsilon_end)
+    assert epsilon in ends
+    shares = spread_epsilon(config.exploration, jnp.float32(epsilon), config.num_envs)
+    assert float(shares.mean()) == pytest.approx(mean, abs=0.005)
+    assert (float(shares.max()) == 1.0) == (epsilon == 1.0)
 
 
 @pytest.mark.parametrize("epsilon", [-0.1, 1.1, float("nan")])

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import os
+
 import gymnasium
 import numpy as np
 import pytest
@@ -57,6 +59,30 @@ def test_invalid_actions_are_refused(action, message):
         ValueError, match=f"actions must be one whole number from 0 to 13, {message}"
     ):
         env.step(action)
+
+
+# Python and jax warn of a fork.
+@pytest.mark.filterwarnings("ignore:.*fork.*")
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="there is no fork here")
+@pytest.mark.parametrize("kind", ["ArmCubeEnv", "ArmCubeVectorEnv"])
+def test_a_process_that_was_forked_from_one_with_jax_is_refused(kind):
+    make = getattr(mjx_arm.interop, kind)
+    options = {"num_envs": 2} if kind == "ArmCubeVectorEnv" else {}
+    ours, theirs = os.pipe()
+    child = os.fork()
+    if child == 0:
+        try:
+            make("A", **options, **OPTIONS)
+        except BaseException as error:
+            os.write(theirs, f"{type(error).__name__}: {error}".encode())
+        finally:
+            os._exit(0)
+    os.close(theirs)
+    with os.fdopen(ours) as file:
+        said = file.read()
+    os.waitpid(child, 0)
+    assert said.startswith("ValueError: this process was forked from one that runs jax")
+    assert "context='spawn'" in said
 
 
 def test_step_before_reset_is_refused():

@@ -1,11 +1,12 @@
 from __future__ import annotations
 
 import io
+import threading
 
 import pytest
 from rich.console import Console
 
-from mjx_arm.report.progress import RunProgress
+from mjx_arm.report.progress import Heartbeat, RunProgress, phase
 
 
 def row(**changes: float) -> dict[str, float]:
@@ -56,3 +57,106 @@ def test_the_metrics_of_several_seeds_are_averaged(monkeypatch, seeds):
         progress.update(100, [row(success_rate=i / 10, episodes=1.0) for i in range(seeds)])
     expected = {1: "success 0 %", 3: "success 10 %"}[seeds]
     assert expected in file.getvalue()
+
+
+class Output(io.StringIO):
+    """What is printed, for a test that waits for it."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._changed = threading.Condition()
+
+    def write(self, text: str) -> int:
+        with self._changed:
+            self._changed.notify_all()
+            return super().write(text)
+
+    def wait_for(self, text: str, times: int = 1) -> None:
+        with self._changed:
+            assert self._changed.wait_for(lambda: self.getvalue().count(text) >= times, timeout=60)
+
+
+def beats() -> bool:
+    """Whether the thread of a heartbeat runs."""
+    return any(thread.name == "heartbeat" for thread in threading.enumerate())
+
+
+@pytest.fixture
+def output() -> Output:
+    return Output()
+
+
+def test_a_long_phase_is_named_with_its_time_until_it_ends(output):
+    console = Console(file=output, width=200)
+    with phase(console, "compiling", "about a minute", seconds=0.01):
+        output.wait_for("compiling, 0:00 min so far\n", times=3)
+    assert not beats()
+    lines = output.getvalue().splitlines()
+    assert lines[0] == "compiling: about a minute"
+    assert set(lines[1:]) == {"compiling, 0:00 min so far"}
+
+
+def test_the_time_of_a_phase_grows(output, monkeypatch):
+    now = [0.0]
+    monkeypatch.setattr("mjx_arm.report.progress.time.monotonic", lambda: now[0])
+    with Heartbeat(Console(file=output, width=200), "compiling", seconds=1e-3):
+        now[0] = 65.0
+        output.wait_for("compiling, 1:05 min so far")
+
+
+def test_a_heartbeat_ends_with_an_error_too(output):
+    with (
+        pytest.raises(RuntimeError, match="enough"),
+        phase(Console(file=output), "compiling", seconds=0.01),
+    ):
+        raise RuntimeError("enough")
+    assert not beats()
+
+
+@pytest.mark.parametrize("options", [{"force_terminal": True}, {"quiet": True}])
+def test_a_terminal_and_a_quiet_console_have_no_heartbeat(output, options):
+    with phase(Console(file=output, **options), "compiling", seconds=0.0):
+        assert not beats()
+
+
+def test_lines_of_both_threads_stay_whole(output):
+    # Without a pause between two lines.
+    with Heartbeat(Console(file=output, width=200), "compiling", seconds=0.0) as heartbeat:
+        for _ in range(100):
+            heartbeat.say("x" * 60)
+        output.wait_for("so far")
+    lines = output.getvalue().splitlines()
+    assert set(lines) == {"x" * 60, "compiling, 0:00 min so far"}
+    assert lines.count("x" * 60) == 100
+
+
+def test_an_output_that_fails_ends_a_heartbeat_without_a_word():
+    failed = threading.Event()
+
+    class Full(io.StringIO):
+        def write(self, text: str) -> int:
+            failed.set()
+            raise OSError(28, "No space left on device")
+
+    with Heartbeat(Console(file=Full()), "compiling", seconds=0.0):
+        assert failed.wait(60)
+    assert not beats()
+
+
+def test_a_long_chunk_and_a_long_selection_are_named(output):
+    with RunProgress(Console(file=output, width=200), total=200, seconds=0.01) as progress:
+        output.wait_for("training, 0:00 min so far")
+        progress.phase("selecting: 200 episodes")
+        output.wait_for("selecting: 200 episodes, 0:00 min so far")
+        progress.update(100, [row()])
+        output.wait_for("100 of 200 steps (50 %), 100 steps/s")
+        before = output.getvalue().count("training, ")
+        output.wait_for("training, 0:00 min so far", times=before + 1)
+        progress.update(200, [row()])
+    assert not beats()
+    assert "\nselecting: 200 episodes\n" in output.getvalue()
+
+
+def test_a_chunk_whose_next_one_would_be_late_has_a_line(monkeypatch):
+    lines = printed([row()] * 6, monkeypatch, seconds=20.0)
+    assert len(lines) == 6

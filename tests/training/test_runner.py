@@ -120,7 +120,8 @@ def resume(folder: pathlib.Path, **options):
 @pytest.fixture(scope="module")
 def plain(tmp_path_factory) -> pathlib.Path:
     folder = tmp_path_factory.mktemp("runner") / "plain"
-    train(folder)
+    _, output = train(folder)
+    (folder.parent / "output.txt").write_text(output)
     return folder
 
 
@@ -185,6 +186,29 @@ def test_an_own_environment_and_algorithm_reach_training(tmp_path, monkeypatch):
         resume(folder, env=other, algorithm=make_own, total_steps=320)
     resume(folder, env=env, algorithm=make_own, total_steps=320)
     assert [row["env_steps"] for row in read_metrics(folder)] == [80, 160, 240, 320]
+
+
+def test_the_folder_is_named_first_and_then_each_phase(plain):
+    lines = (plain.parent / "output.txt").read_text().splitlines()
+    assert lines[0] == f"run folder: {plain}"
+    assert lines[1].startswith("device: ")
+    phases = [
+        *("compiling: about a minute", "starting the environments", "training: 240 "),
+        *("drawing the curves", "evaluating: 2 episodes", "rendering a video"),
+        "writing the report",
+    ]
+    found = [next(i for i, line in enumerate(lines) if line.startswith(phase)) for phase in phases]
+    assert found == sorted(found)
+
+
+def test_a_program_that_forbids_rank_promotion_can_train(tmp_path):
+    """As by `JAX_NUMPY_RANK_PROMOTION=raise`, which is meant for the program's own arrays."""
+    with jax.numpy_rank_promotion("raise"):
+        train(tmp_path / "run")
+        resume(tmp_path / "run", total_steps=320)
+        with pytest.raises(ValueError, match="rank_promotion"):
+            jnp.ones((2, 3)) + jnp.ones(3)
+    assert [row["env_steps"] for row in read_metrics(tmp_path / "run")] == [80, 160, 240, 320]
 
 
 def test_own_parts_reach_a_trainer():

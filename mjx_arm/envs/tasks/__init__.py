@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from mjx_arm.envs.tasks.base import Task, TaskConfig
@@ -23,11 +23,13 @@ class TaskEntry:
       make: `(config, scene, arm) -> Task`.
       config: the class of its options.
       scene: name or path of the scene that it takes by default.
+      units: of what it measures, by name.
     """
 
     make: Callable[..., Task]
     config: type[TaskConfig]
     scene: str
+    units: Mapping[str, str] = dataclasses.field(default_factory=dict)
 
 
 _tasks: dict[str, TaskEntry] = {}
@@ -43,6 +45,7 @@ def register(
     *,
     config: type[TaskConfig] = TaskConfig,
     scene: str = "arm_cube",
+    units: Mapping[str, str] | None = None,
 ) -> None:
     """Makes a task known by a name, for `make`, configurations and the command line.
 
@@ -51,12 +54,13 @@ def register(
       make: `(config, scene, arm) -> Task`, such as the task's class.
       config: the class of the task's options, made by `mjx_arm.options.options`.
       scene: name or path of the scene that the task takes by default.
+      units: of the numbers that the task measures, for figures: `{"distance": "m"}`.
 
     Raises:
       ValueError: the name is taken by another task, or is not made of letters, digits, `_` and `-`;
         or `make` is no function.
     """
-    entry = TaskEntry(make, config, scene)
+    entry = TaskEntry(make, config, scene, dict(units or {}))
     check_value("name", str, name)
     if not _NAME.fullmatch(name):
         raise ValueError(
@@ -105,9 +109,15 @@ def task_names() -> list[str]:
     return list(_tasks)
 
 
-register("lift", Lift, config=LiftConfig)
-register("reach", Reach, config=ReachConfig, scene="arm_reach")
-register("push", Push, config=PushConfig, scene="arm_push")
+register("lift", Lift, config=LiftConfig, units={"height": "m", "distance": "m"})
+register("reach", Reach, config=ReachConfig, scene="arm_reach", units={"distance": "m"})
+register(
+    "push",
+    Push,
+    config=PushConfig,
+    scene="arm_push",
+    units={"distance": "m", "to_cube": "m"},
+)
 
 __all__: list[Any] = [
     "Task",

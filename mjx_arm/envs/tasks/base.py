@@ -79,7 +79,8 @@ class Task(Protocol):
         """Named quantities of a state, bools and float32, each `[]`.
 
         `success` (bool) is among them: the episode terminates in it. All are metrics of the run,
-        entries of `info`, and what rewards are computed from.
+        entries of `info`, and what rewards are computed from. `register` takes the units of the
+        float32 ones.
         """
         ...
 

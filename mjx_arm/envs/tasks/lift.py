@@ -161,12 +161,12 @@ class Lift:
         cube = poses.geom_xpos[self.cube_geom]
         offset = poses.site_xpos[self.arm.grasp_site] - cube
         height = cube[2] - _f32(self._half)
-        held = grasped(self, poses, state.ctrl) & ~state.physics.diverged
+        is_grasped = grasped(self, poses, state.ctrl) & ~state.physics.diverged
         return {
-            "grasped": held,
+            "grasped": is_grasped,
             "height": height,
             "distance": jnp.sqrt(jnp.sum(jnp.square(offset))),
-            "success": held & (height >= self.config.lift),
+            "success": is_grasped & (height >= self.config.lift),
         }
 
     def features(self, state: EnvState) -> jax.Array:
@@ -245,13 +245,13 @@ def _terms(
     config: LiftConfig, after: Snapshot, *, reach: jax.Array, grasp: jax.Array, lift: jax.Array
 ) -> dict[str, jax.Array]:
     """`reach` without a grasp, `grasp` and `lift` with one, and on success `success` alone."""
-    held, success = after.measured["grasped"], after.measured["success"]
+    is_grasped, success = after.measured["grasped"], after.measured["success"]
     zero = jnp.zeros_like(reach)
-    holding = held & ~success
+    in_grasp = is_grasped & ~success
     return {
-        "reach": jnp.where(held | success, zero, reach),
-        "grasp": jnp.where(holding, grasp, zero),
-        "lift": jnp.where(holding, lift, zero),
+        "reach": jnp.where(is_grasped | success, zero, reach),
+        "grasp": jnp.where(in_grasp, grasp, zero),
+        "lift": jnp.where(in_grasp, lift, zero),
         "success": jnp.where(success, jnp.full_like(zero, config.success_reward), zero),
     }
 
