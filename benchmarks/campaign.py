@@ -270,7 +270,7 @@ def _run(arguments: list[str]) -> subprocess.CompletedProcess[str]:
 def flips(folder: pathlib.Path, scale: float) -> Iterator[Row]:
     """Flips single bits in every kind of file of a run."""
     whole, rng = folder / "run", random.Random(0)
-    run_to_end(whole, [*STATE, "--total-steps", "4000"])
+    run_to_end(whole, STATE)
     more = ("--total-steps", "4200", "--eval-episodes", "4")
 
     def row(what: str, wanted: str) -> Row:
@@ -482,8 +482,8 @@ def _is_valid(name: str, text: str) -> bool:
     return False
 
 
-def nans(folder: pathlib.Path, scale: float) -> Iterator[Row]:
-    """Trains while the controls of 1 % of the steps are NaN."""
+def nans(folder: pathlib.Path, scale: float, observation: str = "packed") -> Iterator[Row]:
+    """Trains while the controls of 1 % of the steps are NaN, on images or on state features."""
     del folder
     for storage in ("states", "pixels"):
         row = Row(
@@ -492,12 +492,17 @@ def nans(folder: pathlib.Path, scale: float) -> Iterator[Row]:
             "counted as diverged; loss and parameters stay finite",
         )
         config = train_config(
-            storage=storage, physics="native", num_envs=8, size=(16, 16), replay_size=4_000
+            storage=storage,
+            observation=observation,
+            physics="native",
+            num_envs=8,
+            size=(16, 16),
+            replay_size=4_000,
         )
         config = set_train_options(
             config, {"batch_size": 8, "learning_starts": 200, "chunk_steps": 800, "hidden": 16}
         )
-        env = mjx_arm.make("A", observation="packed", size=(16, 16), physics="native")
+        env = mjx_arm.make("A", observation=observation, size=(16, 16), physics="native")
         trainer = mjx_arm.make_trainer(config, env=_with_nans(env))
         state = trainer.init(jax.random.key(0))
         steps, diverged = 0, 0.0

@@ -266,6 +266,8 @@ def resume(
     _check_whole_run(folder)
     saved = load_run(folder)
     check_untouched(folder, saved)
+    for own in seed_folders(folder, saved.config):
+        last_env_steps(own)  # damaged metrics are found before anything is compiled
     objects = Objects(env=env, network=network, reward=reward, algorithm=algorithm)
     check_record(saved.objects, saved.config, objects, str(folder))
     scene = _scene_of(folder, saved, objects)
