@@ -31,7 +31,7 @@ def test_a_line_without_a_metric_is_named(name, count, tmp_path):
         for read in (
             read_metrics,
             lambda folder: keep_metrics(folder, 10_000),
-            lambda folder: plot_curves([folder], into=folder),
+            lambda folder: plot_curves([folder], into=folder, units={}),
         ):
             with pytest.raises(ValueError, match=message):
                 read(tmp_path)
@@ -72,7 +72,7 @@ def test_a_metric_that_is_always_known_may_not_be_null(name, tmp_path):
 def test_a_run_that_another_version_continued_has_more_metrics(tmp_path):
     write_rows(tmp_path, [*rows(2), row(30_000, rate=0.5) | {"new": 1.0}])
     assert [len(each) for each in read_metrics(tmp_path)] == [15, 15, 16]
-    for path in plot_curves([tmp_path], into=tmp_path):
+    for path in plot_curves([tmp_path], into=tmp_path, units={}):
         assert path.is_file()
 
 
