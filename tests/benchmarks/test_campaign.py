@@ -84,7 +84,7 @@ def test_generated_configurations_are_taken_or_rejected_in_a_sentence(tmp_path, 
     check(list(campaign.options(tmp_path, 0.2)), 60, 12)
 
 
-@pytest.mark.parametrize("observation", ["state", pytest.param("packed", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("observation", ["state", pytest.param("packed", marks=pytest.mark.long)])
 def test_steps_with_nans_do_not_reach_the_parameters(observation, tmp_path):
     check(list(campaign.nans(tmp_path, 0.1, observation)), 3, 3)
 
@@ -108,7 +108,7 @@ def test_the_memory_of_a_run_is_watched(tmp_path):
     assert int(second) > 100
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.skipif(sys.platform != "linux" or os.geteuid() != 0, reason="mounting needs root")
 def test_a_run_on_a_full_disk_continues_when_there_is_room(tmp_path):
     check(list(campaign.disks(tmp_path, 0.25)), 1)

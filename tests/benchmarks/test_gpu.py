@@ -82,7 +82,7 @@ def test_it_is_imported_on_a_bare_machine():
     assert on_a_bare_machine("print(len(gpu.CELLS))") == "3"
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_it_measures_on_a_bare_machine(tmp_path):
     cells = ["device", "parity", "a", "physics+render at 8192", "training at 8192"]
     arguments = ["--json", str(tmp_path), "--tiny", "--minutes", "30", "--cells", *cells]

@@ -51,9 +51,8 @@ _SHORT_TRIES = {"eval": {"episodes": 2, "max-steps": 20}, "play": {"max-steps": 
 # The true levels of the stand-in are read three times an agent, and never by a test.
 _OWN_TESTS = {"compare", "deploy", "sweep", "transfer", "view"}
 _SHELL = all_snippets("sh")
-# The first one of each of these commands on the pages is a slow test, and so is this training.
+# The first one of each of these commands on the pages is a slow test.
 _CHEAP = ("agents", "eval", "export", "play")
-_CHEAP_TRAINING = ("train", "--preset", "smoke", "--out", "runs/first")
 # Scripts for Slurm, and what their variables are in the tests.
 _SBATCH = sorted((ROOT / "docs").rglob("*.sbatch"))
 _VARIABLES = {"$run": "runs/first", "$RUN": "runs/first"}
@@ -214,7 +213,6 @@ def _runs() -> list[object]:
                 continue
             found.setdefault(tuple(words[1:]), (environment.get("PYTHONPATH", ""), _name(snippet)))
     cheap = {next(x for x in found if x[0] == command) for command in _CHEAP}
-    cheap.add(_CHEAP_TRAINING)
     assert cheap <= set(found)
     return [
         pytest.param(

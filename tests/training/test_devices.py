@@ -107,7 +107,7 @@ def test_a_student_that_sees_pixels_learns_and_acts_on_all_devices():
     assert found["gap"] < 1e-5
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_seeds_are_spread_where_their_number_allows_it():
     found = four_devices("seeds")["seeds"]
     assert found["spread"] == "P('device',)"

@@ -322,7 +322,7 @@ def test_a_signal_to_one_of_two_processes_stops_both_and_two_resume(tmp_path, ca
     assert [row["env_steps"] for row in read_metrics(folder)] == list(range(160, done + 321, 160))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_two_killed_processes_are_resumed_by_two(tmp_path):
     """With the default preset, whose student sees pixels."""
     folder = tmp_path / "run"
