@@ -208,13 +208,23 @@ def test_the_cube_is_dragged_while_paused(page, viewer):
     """By the arrow of its handle that points along y, whose length is 12 cm."""
     pause(page)
     before = viewer.session.position("cube")
-    page.wait_for_timeout(500)  # the handle has come to the cube
     start, end = (pixel_of(viewer, before + np.asarray([0.0, y, 0.0])) for y in (0.06, 0.11))
-    page.mouse.move(*start)
-    page.mouse.down()
-    page.mouse.move(*((start + end) / 2), steps=5)
-    page.mouse.move(*end, steps=5)
-    wait_until(lambda: viewer.session.position("cube")[1] > before[1] + 0.04, page)
+
+    def is_dragged() -> bool:
+        return viewer.session.position("cube")[1] > before[1] + 0.04
+
+    # Until the browser has rendered the handle at the cube, the mouse grips nothing.
+    for _ in range(20):
+        page.wait_for_timeout(1000)
+        page.mouse.move(*start)
+        page.mouse.down()
+        page.mouse.move(*((start + end) / 2), steps=5)
+        page.mouse.move(*end, steps=5)
+        page.wait_for_timeout(2000)
+        if is_dragged():
+            break
+        page.mouse.up()
+    assert is_dragged()
     step = viewer.session.step_count
     page.mouse.up()
     page.wait_for_timeout(500)
