@@ -36,7 +36,7 @@ _WARM_UP = 100_000
 _SPREAD_UPDATES = 1_000
 # Share of the student's learning rate that is left at the end of its decay.
 _LAST_RATE = 0.05
-# Least spread of a state's advantages, as a share of the running mean.
+# Least spread of a state's advantages, as a share of that over all states.
 _LEAST_SPREAD = 0.1
 # Weight of the squared error of the mean Q-value beside the cross-entropy.
 _VALUE_WEIGHT = 0.1
@@ -232,8 +232,8 @@ class Distill:
         return Student(params, opt_state, averaged, spread), self.shard.mean(metrics)
 
 
-def advantage_spread(target: jax.Array, mean: jax.Array) -> jax.Array:
-    """Standard deviation of each state's advantages, `[B] float32`, within bounds.
+def advantage_spread(target: jax.Array, overall: jax.Array) -> jax.Array:
+    """Standard deviation of each state's advantages, `[B] float32`, kept within two bounds.
 
     Far from success all actions are worth nearly the same: the median state has a fifth of the root
     mean square over all states. With one temperature for all of them the student would hardly learn
@@ -241,11 +241,11 @@ def advantage_spread(target: jax.Array, mean: jax.Array) -> jax.Array:
 
     Args:
       target: `[B, A] float32`, Q-values.
-      mean: `[] float32`, root mean square over all states. It is also the most: near success the
-        student needs the best action as well. A tenth of it is the least: differences far below
-        are the teacher's own errors.
+      overall: `[] float32`, root mean square of the advantages over all states: the upper bound,
+        since near success too the student must learn which action is the best. A tenth of it is
+        the lower bound: smaller differences are the teacher's own errors.
     """
-    return jnp.clip(jnp.std(target, axis=-1), _LEAST_SPREAD * mean, mean)
+    return jnp.clip(jnp.std(target, axis=-1), _LEAST_SPREAD * overall, overall)
 
 
 def imitation_loss(q: jax.Array, target: jax.Array, temperature: jax.Array) -> jax.Array:

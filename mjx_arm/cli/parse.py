@@ -21,7 +21,7 @@ from mjx_arm.config import TrainConfig, set_train_options
 from mjx_arm.devices import check_device
 from mjx_arm.options import check_name, flat_annotations
 from mjx_arm.presets import PRESETS
-from mjx_arm.training.objects import TOLD, check_told
+from mjx_arm.training.objects import ON_COMMAND_LINE, check_given_again
 from mjx_arm.training.processes import join_processes
 from mjx_arm.training.run_folder import parse_run, read_text
 
@@ -76,7 +76,7 @@ def _start(kind: type[Trains], arguments: Sequence[str]) -> tuple[Trains, dict[s
     These two decide which options there are.
     """
     first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    for name in ("preset", "config", "task", "algorithm", *TOLD):
+    for name in ("preset", "config", "task", "algorithm", *ON_COMMAND_LINE):
         first.add_argument(f"--{name}", nargs="?")
     known = first.parse_known_args(arguments)[0]
     preset = known.preset or default_preset()
@@ -86,8 +86,8 @@ def _start(kind: type[Trains], arguments: Sequence[str]) -> tuple[Trains, dict[s
         if known.preset is not None:
             raise ValueError("--preset and --config exclude each other: give one of them")
         saved = parse_run(read_text(pathlib.Path(known.config)), known.config)
-        told = [name for name in TOLD if getattr(known, name) is not None]
-        check_told(saved.objects, told, known.config)
+        given = [name for name in ON_COMMAND_LINE if getattr(known, name) is not None]
+        check_given_again(saved.objects, given, known.config)
         options = saved.config
     parts = {"task": known.task, "algorithm": known.algorithm}
     chosen = {name: value for name, value in parts.items() if value is not None}

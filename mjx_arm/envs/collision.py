@@ -105,10 +105,11 @@ class Collision:
         in do not count: its servos sag and lag, so that it is often nearer than any command.
 
         Args:
-          before: what `poses_of` makes poses of; without it, poses as those of `commanded`.
+          before: the argument of `poses_of` for the last command; without `poses_of`, the poses.
           commanded: poses of `geoms` alone, with the arm's joints where the command would have
             them.
-          poses_of: makes the same of the last command. It is only called where something is near.
+          poses_of: returns the poses of `geoms` alone at the last command. Its result is only
+            computed where something is near.
         """
 
         @_called_once

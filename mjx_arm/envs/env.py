@@ -326,7 +326,8 @@ class Env:
         """Whether a command would take the arm into itself, its base or the ground: `[] bool`.
 
         Args:
-          qpos: `[nq] float32`, where the fingers are.
+          qpos: `[nq] float32`, the present state; of it only what no servo of the arm's joints
+            moves is used, such as the fingers.
           ctrl: `[nu] float32`, the last command.
           wanted: `[nu] float32`, the command.
           params: of the episode.

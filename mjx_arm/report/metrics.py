@@ -109,9 +109,10 @@ def _read_rows(path: pathlib.Path) -> list[dict[str, float]]:
 
 
 def _check_names(path: pathlib.Path, rows: list[dict[str, float]]) -> None:
-    """Refuses a row that lacks a metric of a row before it, and a first row without one of all.
+    """Refuses a row that lacks a metric which an earlier row has.
 
-    A later row may have more than those before it: another version has continued the run.
+    The first row must also have what all later ones have. Later rows may have more: another version
+    has continued the run.
     """
     later = [name for name in rows[-1] if all(name in row for row in rows[1:])] if rows else []
     known: dict[str, None] = dict.fromkeys(later)

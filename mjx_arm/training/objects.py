@@ -23,8 +23,8 @@ Record = dict[str, dict[str, str]]
 
 # Objects that only this process has, such as lambdas, by the token that a record has of them.
 _ONLY_HERE: dict[str, Any] = {}
-# Objects that a command line can name.
-TOLD = ("reward", "network")
+# Objects that the command line takes as `module:name`.
+ON_COMMAND_LINE = ("reward", "network")
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -67,10 +67,10 @@ def record(config: TrainConfig, objects: Objects) -> Record:
 
 
 def parse_record(values: Any, where: str) -> Record:
-    """A record from JSON.
+    """Checks what a JSON file has as the record of a run, and returns it.
 
     Raises:
-      ValueError: it is none.
+      ValueError: it is not a record.
     """
     entries = values.values() if isinstance(values, dict) else [None]
     if all(isinstance(x, dict) and all(isinstance(y, str) for y in x.values()) for x in entries):
@@ -126,21 +126,21 @@ def check_record(recorded: Record, config: TrainConfig, objects: Objects, where:
             )
 
 
-def check_told(recorded: Record, told: Collection[str], where: str) -> None:
+def check_given_again(recorded: Record, given: Collection[str], where: str) -> None:
     """Refuses a configuration to start from that lacks an object which its run was passed.
 
     Args:
       recorded: the objects of the run.
-      told: names of those that are given anew, as `module:name`.
+      given: names of those that are given again, as `module:name`.
       where: the file of the configuration.
 
     Raises:
-      ValueError: one is not given anew.
+      ValueError: one is not given again.
     """
     for name, entry in recorded.items():
-        if "given" in entry and name not in told:
+        if "given" in entry and name not in given:
             option, again = f"give --{name} MODULE:NAME", f"train from Python with {name}= again"
-            give = option if name in TOLD else again
+            give = option if name in ON_COMMAND_LINE else again
             raise ValueError(
                 f"{where} is of a run that was passed {name}={entry['given']} from Python, which "
                 f"the file does not hold: {give}"

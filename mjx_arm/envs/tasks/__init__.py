@@ -33,7 +33,7 @@ class TaskEntry:
 
 
 _tasks: dict[str, TaskEntry] = {}
-# Are told the name of each task; see `on_register`.
+# Functions that are called with the name of each new task; see `on_register`.
 _listeners: list[Callable[[str], None]] = []
 # A colon would make a name a reference, and gymnasium's ids are made of names.
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]*")
