@@ -165,6 +165,8 @@ class RunProgress:
       console: where it prints.
       total: environment steps of the whole run.
       done: environment steps that were made before.
+      slower_from: environment steps from which on a step takes longer, as in `distill` where the
+        student starts. Until then the time left is not known.
       seconds: between two lines.
     """
 
@@ -174,9 +176,11 @@ class RunProgress:
         total: int,
         done: int = 0,
         *,
+        slower_from: int = 0,
         seconds: float = _SECONDS_BETWEEN_LINES,
     ):
         self._console, self._total, self._done = console, total, done
+        self._slower_from = slower_from if slower_from < total else 0
         self._seconds = seconds
         self._success = _Smoothed(_EPISODES)
         self._speed = _Smoothed(_CHUNKS)
@@ -215,7 +219,9 @@ class RunProgress:
         """
         metrics = {name: sum(row[name] for row in rows) / len(rows) for name in rows[0]}
         self._success.add(metrics["success_rate"], metrics["episodes"])
-        self._speed.add(1.0 / metrics["steps_per_s"], 1.0)
+        if self._done >= self._slower_from:  # all of the chunk is slow
+            self._speed.add(1.0 / metrics["steps_per_s"], 1.0)
+        self._done = completed
         left = (self._total - completed) * self._speed.mean
         text = self._describe(metrics, left)
         self._bar.update(self._task, completed=completed, metrics=text)
@@ -244,7 +250,10 @@ class RunProgress:
         if "q_mean" in metrics:  # not every algorithm has it
             parts.append(f"max Q {metrics['q_mean']:.1f}")
         parts.append(f"ε {metrics['epsilon']:.2f}")
-        parts.append(f"{_minutes(seconds_left)} left")
+        if math.isnan(seconds_left):
+            parts.append(f"time left unknown before {self._slower_from:,} steps")
+        else:
+            parts.append(f"{_minutes(seconds_left)} left")
         return ", ".join(parts)
 
 
@@ -267,8 +276,6 @@ class _Smoothed:
 
 
 def _minutes(seconds: float) -> str:
-    if math.isnan(seconds):
-        return "unknown time"
     minutes, rest = divmod(round(seconds), 60)
     return (
         f"{minutes // 60} h {minutes % 60:02d} min"

@@ -562,7 +562,10 @@ class _Loop:
             stack.enter_context(_offering(checkpoints))
             interruption = stack.enter_context(_Interruption(self.folder))
             total = config.num_chunks * per_chunk
-            progress = stack.enter_context(RunProgress(self.console, total, done * per_chunk))
+            slower_from = getattr(config.algo, "student_starts", 0)
+            progress = stack.enter_context(
+                RunProgress(self.console, total, done * per_chunk, slower_from=slower_from)
+            )
             results = self._results(started)
             for result in results:
                 stack.enter_context(result.writer)

@@ -14,11 +14,14 @@ def row(**changes: float) -> dict[str, float]:
     return values | {"epsilon": 0.1} | changes
 
 
-def printed(rows: list[dict[str, float]], monkeypatch, seconds: float) -> list[str]:
+def printed(
+    rows: list[dict[str, float]], monkeypatch, seconds: float, slower_from: int = 0
+) -> list[str]:
     now = [0.0]
     monkeypatch.setattr("mjx_arm.report.progress.time.monotonic", lambda: now[0])
     file = io.StringIO()
-    with RunProgress(Console(file=file, width=200), total=100 * len(rows)) as progress:
+    console, total = Console(file=file, width=200), 100 * len(rows)
+    with RunProgress(console, total, slower_from=slower_from) as progress:
         for i, values in enumerate(rows):
             now[0] += seconds
             progress.update(100 * (i + 1), [values])
@@ -37,6 +40,18 @@ def test_the_time_left_follows_the_speed_of_the_last_chunks(monkeypatch):
     lines = printed([fast] * 50 + [slow] * 50 + [fast], monkeypatch, seconds=30.0)
     # 100 steps are left, at 10 steps/s; the 50 fast chunks are forgotten.
     assert "0:10 min left" in lines[-2]
+
+
+def test_the_time_left_is_not_known_before_steps_become_slower(monkeypatch):
+    rows = [row(steps_per_s=1000.0)] * 3 + [row(steps_per_s=10.0)] * 2
+    lines = printed(rows, monkeypatch, seconds=30.0, slower_from=250)
+    # The third chunk is slow in part only, and the fourth is the first one that is slow as a whole.
+    assert [line.rsplit(", ", 1)[1] for line in lines] == [
+        *["time left unknown before 250 steps"] * 3,
+        *("0:10 min left", "0:00 min left"),
+    ]
+    # A run that ends before has one speed.
+    assert "0:00 min left" in printed(rows[:2], monkeypatch, 30.0, slower_from=250)[-1]
 
 
 def test_a_chunk_without_an_episode_keeps_the_success_rate(monkeypatch):
