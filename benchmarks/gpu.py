@@ -297,7 +297,8 @@ def training(
     visit: Visit, write: Write, *, num_envs: int, precision: str = "", **options: Any
 ) -> None:
     """The whole loop once it learns, and its memory beside the plan."""
-    base = {"student_starts": 0, "learning_starts": 0} if "algorithm" not in options else {}
+    at_once = {"learning_starts": 0, "student_starts": 0, "student_warm_up": 0}
+    base = {} if "algorithm" in options else at_once
     config = visit.config(num_envs=num_envs, **(base | options))
     config = set_train_options(config, {"chunk_steps": _length(config, visit) * config.num_envs})
     with jax.default_matmul_precision(precision) if precision else contextlib.nullcontext():
@@ -335,11 +336,16 @@ def _cells() -> dict[str, list[Cell]]:
                 part(environment, num_envs=num_envs),
                 60,
             ),
-            Cell(f"training at {num_envs}", "throughput", part(training, num_envs=num_envs), 90),
+            Cell(
+                f"training and driving at {num_envs}",
+                "throughput",
+                part(training, num_envs=num_envs),
+                90,
+            ),
         ]
         if num_envs == many:
             measure = part(training, num_envs=many, **_with_own_ratio(many))
-            name = f"training at {many} with the preset's samples a step"
+            name = f"training and driving at {many} with the preset's samples a step"
             first.append(Cell(name, "throughput", measure, 90))
     for convolution in ("nn.Conv", "patches"):
         measure = part(training, num_envs=many, convolution=convolution)

@@ -25,6 +25,7 @@ from typing import Any
 
 # The machine may have no `packaging`; pip, without which nothing is installed, brings its own.
 from pip._vendor.packaging.requirements import Requirement
+from pip._vendor.packaging.specifiers import SpecifierSet
 
 # What training and `gpu.py` import beyond the image.
 NEEDED = (
@@ -68,6 +69,8 @@ def resolve(python: str, jax: str, needed: Iterable[str]) -> list[dict[str, Any]
     with tempfile.TemporaryDirectory() as empty:
         command = [sys.executable, "-m", "pip", "install", "--quiet", "--dry-run", "--report", "-"]
         command += ["--ignore-installed", "--target", empty, *platform_options(python)]
+        # Else pip compares what jax requires with the Python that runs here.
+        command += ["--ignore-requires-python"]
         done = subprocess.run(
             [*command, f"jax=={jax}", *needed], capture_output=True, text=True, check=False
         )
@@ -76,14 +79,21 @@ def resolve(python: str, jax: str, needed: Iterable[str]) -> list[dict[str, Any]
     return json.loads(done.stdout)["install"]
 
 
-def to_fetch(resolved: list[dict[str, Any]]) -> list[str]:
-    """Names and versions of what the image lacks."""
-    names = [(x["metadata"]["name"], x["metadata"]["version"]) for x in resolved]
-    return sorted(
-        f"{name}=={version}"
-        for name, version in names
-        if name.lower().replace("_", "-") not in LEFT_OUT
-    )
+def to_fetch(resolved: list[dict[str, Any]], python: str) -> list[str]:
+    """Names and versions of what the image lacks.
+
+    Raises:
+      ValueError: one of them does not run on that version of Python.
+    """
+    wanted = []
+    for found in (x["metadata"] for x in resolved):
+        if found["name"].lower().replace("_", "-") in LEFT_OUT:
+            continue
+        name, needs = f"{found['name']}=={found['version']}", found.get("requires_python", "")
+        if not SpecifierSet(needs).contains(python):
+            raise ValueError(f"{name} requires Python {needs}, and --python is {python}")
+        wanted.append(name)
+    return sorted(wanted)
 
 
 def split(wheel: pathlib.Path, size: int = PART) -> list[pathlib.Path]:
@@ -123,7 +133,7 @@ def fetch(folder: pathlib.Path, python: str, jax: str, *, warp: bool) -> dict[st
     folder.mkdir(parents=True, exist_ok=True)
     if any(folder.iterdir()):
         raise ValueError(f"{folder} is not empty: give a new or empty folder")
-    wanted = to_fetch(resolve(python, jax, [*NEEDED, *([WARP] if warp else [])]))
+    wanted = to_fetch(resolve(python, jax, [*NEEDED, *([WARP] if warp else [])]), python)
     command = [sys.executable, "-m", "pip", "download", "--quiet", "--no-deps"]
     command += ["--dest", str(folder), *platform_options(python), *wanted]
     done = subprocess.run(command, capture_output=True, text=True, check=False)

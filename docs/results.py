@@ -220,7 +220,15 @@ def _gpu(content: Any) -> Table:
         _to_success(content, "train-a", 0.95, "environment A to 95 %", 3),
         _to_success(content, "train-b", 0.90, "environment B to 90 %", 5),
         _rate(content, "physics+render at 8192", "physics and rendering", 400_000),
-        _rate(content, "training at 8192 with the preset's samples a step", "training", 100_000),
+        _rate(
+            content,
+            "training and driving at 8192 with the preset's samples a step",
+            "training",
+            100_000,
+        ),
+        _whole(content, "train-a", "A"),
+        _whole(content, "train-b", "B"),
+        _parity(content),
     ]
     return ["what", "goal", "measured", "device"], rows
 
@@ -248,6 +256,31 @@ def _rate(content: Any, cell: str, what: str, goal: int) -> list[str]:
     ]
     said = [f"{_number(row['steps_per_s'])} steps/s" for row in rows]
     return [f"{what} of 8,192 environments", f"{goal:,} steps/s", *_cells_of(said, rows)]
+
+
+def _whole(content: Any, file: str, env: str) -> list[str]:
+    """A row of the speed of the trainings of a file, from their first evaluation to their last."""
+    said, rows = [], _measured(content, file)
+    for row in rows:
+        judged = row["judged"]
+        if len(judged) > 1:
+            steps = judged[-1]["env_steps"] - judged[0]["env_steps"]
+            rate = steps / (60 * (judged[-1]["minutes"] - judged[0]["minutes"]))
+            said.append(f"{_number(rate)} steps/s")
+    what = f"a whole training in {env}, with the evaluations between its steps"
+    return [what, "100,000 steps/s", *_cells_of(said, rows)]
+
+
+def _parity(content: Any) -> list[str]:
+    """A row of how far images and a motion are from the stored ones of a CPU."""
+    rows = _measured(content, "parity")
+    said = [
+        f"{100 * row['share_of_pixels_of_another_geom']:.3f} % of the pixels show another geom, "
+        f"the others differ by {row['largest_difference_of_colour']} of 255 at most; qpos by "
+        f"{max(row['largest_difference_of_qpos'].values()):.0e} rad or m after 20 iterations"
+        for row in rows
+    ]
+    return ["images and a motion beside those of a CPU", "equal", *_cells_of(said, rows)]
 
 
 def _measured(content: Any, file: str) -> list[Any]:

@@ -158,6 +158,7 @@ class DistillConfig(AlgorithmConfig):
       n_step: rewards summed before bootstrapping.
       learning_starts: environment steps before the teacher's first update.
       teacher_batch_size: transitions in one update of the teacher.
+      teacher_updates_per_step: updates of the teacher after each step of all environments.
       teacher_hidden: units of each of the teacher's two layers.
       teacher_learning_rate: of the teacher's Adam.
       teacher_polyak: share of the online parameters in each update of its target's.
@@ -173,13 +174,15 @@ class DistillConfig(AlgorithmConfig):
         rate falls by a cosine to a twentieth; 0: it stays.
       student_polyak: share of the newest parameters in each update of the averaged ones, which act
         and are judged.
-      student_share: share of the environments that the student drives, once it learns.
+      student_warm_up: images that the student learns from before it drives.
+      student_share: share of the environments that the student drives, after that.
       student_temperature: of the softmax over advantages that the student imitates, in units of
         their standard deviation in the state.
     """
 
     n_step: Count = 5
     teacher_batch_size: Count = 512
+    teacher_updates_per_step: Count = 1
     teacher_hidden: Count = 512
     teacher_learning_rate: Positive = 3e-4
     teacher_polyak: Share = 0.005
@@ -193,6 +196,7 @@ class DistillConfig(AlgorithmConfig):
     student_learning_rate: Positive = 1e-3
     student_decay_steps: CountOrZero = 0
     student_polyak: Share = 0.005
+    student_warm_up: CountOrZero = 300_000
     student_share: Share = 0.5
     student_temperature: Positive = 0.5
 
@@ -298,7 +302,8 @@ class TrainConfig:
     def samples_per_step(self) -> float:
         """Transitions that learning samples for each environment step."""
         if isinstance(self.algo, DistillConfig):
-            return self.algo.teacher_batch_size / self.num_envs
+            updates = self.algo.teacher_updates_per_step
+            return self.algo.teacher_batch_size * updates / self.num_envs
         assert isinstance(self.algo, DQNConfig)
         return self.algo.batch_size * self.algo.updates_per_step / self.num_envs
 

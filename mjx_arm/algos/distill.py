@@ -30,8 +30,6 @@ _STUDENT_METRICS: dict[str, str] = dict.fromkeys(
     ("student_loss", "student_agreement"), "student_updates"
 )
 
-# Environment steps between the student's first update and the first step that it drives.
-_WARM_UP = 100_000
 # The spread of the teacher's advantages is averaged over about this number of updates.
 _SPREAD_UPDATES = 1_000
 # Share of the student's learning rate that is left at the end of its decay.
@@ -123,7 +121,10 @@ class Distill:
 
     def acts_on_obs(self, env_steps: jax.Array) -> jax.Array:
         """Whether the student drives its share of the environments already."""
-        return env_steps >= self.config.student_starts + _WARM_UP
+        config = self.config
+        images = config.student_batch_size * config.student_updates_per_step
+        warm_up = -(-config.student_warm_up // images) * self.num_envs
+        return env_steps >= config.student_starts + warm_up
 
     def q_values(self, pair: Pair, obs: Obs, frame: Frame, env_steps: jax.Array) -> jax.Array:
         """The student's Q-values where it drives, the teacher's in the other environments."""
@@ -158,7 +159,7 @@ class Distill:
     def learn(
         self, key: jax.Array, pair: Pair, replay: Replay, env_steps: jax.Array
     ) -> tuple[Pair, dict[str, jax.Array]]:
-        """One update of the teacher and several of the student, each from its start on."""
+        """The updates of the teacher and those of the student, each from its start on."""
         config, shard = self.config, self.shard
         teacher_key, student_key = jax.random.split(key)
 
@@ -171,7 +172,14 @@ class Distill:
             )
 
         ready = replay.count > first_update(config, self.num_envs)
-        teacher, taught = update_when(ready, teach, teacher_key, pair.teacher, 1, _TEACHER_METRICS)
+        teacher, taught = update_when(
+            ready,
+            teach,
+            teacher_key,
+            pair.teacher,
+            config.teacher_updates_per_step,
+            _TEACHER_METRICS,
+        )
 
         def imitate(student: Student, key: jax.Array) -> tuple[Student, dict[str, jax.Array]]:
             size = shard.part(config.student_batch_size)

@@ -43,15 +43,11 @@ CONFIG = train_config(
     student_starts=80,
     student_batch_size=8,
     student_updates_per_step=2,
+    # 16 images in each of the 20 steps of a chunk: it drives a chunk after its first update.
+    student_warm_up=320,
 )
 # Vector steps of 80 environment steps.
 CHUNK = CONFIG.chunk_length
-
-
-@pytest.fixture(autouse=True)
-def drives_soon(monkeypatch):
-    """The student drives 80 environment steps after its first update."""
-    monkeypatch.setattr(distill, "_WARM_UP", 80)
 
 
 def with_options(config: TrainConfig, **values) -> TrainConfig:
@@ -244,6 +240,11 @@ def test_microbatches_give_the_update_of_the_whole_batch(monkeypatch):
 )
 def test_the_student_drives_its_share_evenly(share, num_envs, driven):
     toy = make_toy(num_envs, student_share=share, student_starts=100)
+    images = toy.config.student_batch_size * toy.config.student_updates_per_step
+    # As many images as are learnt from in 80 steps of the environments.
+    toy = dataclasses.replace(
+        toy, config=dataclasses.replace(toy.config, student_warm_up=80 // num_envs * images)
+    )
     frame = {"obs": jnp.ones((num_envs, 4)), "features": jnp.ones((num_envs, 2))}
     pair = toy.init(jax.random.key(0), frame["obs"][:1], jax.tree.map(lambda x: x[:1], frame))
     of_teacher = toy.teacher.apply(pair.teacher.params, frame["features"])
@@ -283,17 +284,15 @@ def run_chunks(trainer: Trainer, state, chunks: range):
 @pytest.fixture(scope="module")
 def run():
     """Four chunks: nobody drives in the first two, the student drives from the third on."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(distill, "_WARM_UP", 80)
-        trainer = make_trainer(CONFIG)
-        states, rows = [trainer.init(run_keys(CONFIG))], []
-        for chunk in range(4):
-            # A chunk donates its argument.
-            copy = jax.tree.map(jnp.copy, states[-1])
-            state, row = run_chunks(trainer, copy, range(chunk, chunk + 1))
-            states.append(state)
-            rows += row
-        assert trainer.run_chunk._cache_size() == 1
+    trainer = make_trainer(CONFIG)
+    states, rows = [trainer.init(run_keys(CONFIG))], []
+    for chunk in range(4):
+        # A chunk donates its argument.
+        copy = jax.tree.map(jnp.copy, states[-1])
+        state, row = run_chunks(trainer, copy, range(chunk, chunk + 1))
+        states.append(state)
+        rows += row
+    assert trainer.run_chunk._cache_size() == 1
     return trainer, states, rows
 
 
@@ -310,6 +309,44 @@ def test_the_teacher_learns_before_the_student_starts(run):
     assert equal(learners[0].student, learners[1].student)
     assert differs(learners[1].student.params, learners[2].student.params)
     assert differs(learners[1].student.averaged, learners[2].student.averaged)
+
+
+def test_the_teacher_may_have_several_updates_in_a_step(run):
+    """Two updates of a step are those of two calls with one update each, with the same keys."""
+    trainer, states, _ = run
+    several = make_trainer(with_options(CONFIG, teacher_updates_per_step=2)).algorithm
+    key, replay, steps = jax.random.key(5), states[2].replay, jnp.int32(0)
+    pair, counts = jax.jit(several.learn)(key, states[2].learner, replay, steps)
+    assert counts["updates"] == 2
+    one = dataclasses.replace(trainer.algorithm, config=with_options(CONFIG).algo)
+    keys = jax.random.split(jax.random.split(key)[0], 2)
+    config, frames = CONFIG.algo, one.frames
+    expected = states[2].learner.teacher
+    for each in keys:
+        batch = sample(replay, each, config.teacher_batch_size, config.n_step, config.gamma)
+        features = (frames.features(batch.frame), frames.features(batch.next_frame))
+        expected = one.teacher.update(expected, batch, *features)[0]
+    for leaf, other in zip(*map(jax.tree.leaves, (pair.teacher, expected)), strict=True):
+        np.testing.assert_allclose(leaf, other, rtol=1e-5, atol=1e-6)
+    config = with_options(CONFIG, teacher_updates_per_step=2)
+    assert config.samples_per_step == 2 * CONFIG.samples_per_step
+
+
+@pytest.mark.parametrize(
+    ("num_envs", "batch", "updates", "steps"), [(64, 64, 3, 1_563), (4_096, 512, 8, 74)]
+)
+def test_the_student_drives_after_the_same_number_of_images(num_envs, batch, updates, steps):
+    config = dataclasses.replace(
+        CONFIG.algo,
+        student_starts=8_192,
+        student_warm_up=300_000,
+        student_batch_size=batch,
+        student_updates_per_step=updates,
+    )
+    algorithm = dataclasses.replace(make_toy(num_envs=num_envs), config=config)
+    first = 8_192 + steps * num_envs
+    assert algorithm.acts_on_obs(first)
+    assert not algorithm.acts_on_obs(first - 1)
 
 
 def test_the_state_is_never_shown_to_the_student(run):

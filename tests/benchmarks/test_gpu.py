@@ -84,7 +84,7 @@ def test_it_is_imported_on_a_bare_machine():
 
 @pytest.mark.long
 def test_it_measures_on_a_bare_machine(tmp_path):
-    cells = ["device", "parity", "a", "physics+render at 8192", "training at 8192"]
+    cells = ["device", "parity", "a", "physics+render at 8192", "training and driving at 8192"]
     arguments = ["--json", str(tmp_path), "--tiny", "--minutes", "30", "--cells", *cells]
     said = on_a_bare_machine(f"gpu.main({arguments!r})")
     assert said.count(" s\n") + 1 == len(cells)
@@ -139,7 +139,7 @@ def test_a_row_has_as_many_samples_a_step_as_the_preset():
     preset = mjx_arm.PRESETS["gpu"]
     options = gpu._with_own_ratio(8_192)
     config = set_train_options(preset, {"num_envs": 8_192, **options})
-    assert config.samples_per_step == preset.samples_per_step == 2
+    assert config.samples_per_step == preset.samples_per_step == 4
     assert config.algo.student_batch_size == 2 * preset.algo.student_batch_size
 
 

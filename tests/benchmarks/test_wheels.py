@@ -30,7 +30,16 @@ def test_parts_are_the_file_again(tmp_path):
 def test_what_the_image_has_is_not_fetched():
     names = ("jax", "jaxlib", "orbax-checkpoint", "mujoco", "ml_dtypes", "trimesh", "etils")
     resolved = [{"metadata": {"name": name, "version": "1.0"}} for name in names]
-    assert wheels.to_fetch(resolved) == ["etils==1.0", "mujoco==1.0", "trimesh==1.0"]
+    assert wheels.to_fetch(resolved, "3.12") == ["etils==1.0", "mujoco==1.0", "trimesh==1.0"]
+
+
+def test_what_does_not_run_on_the_other_python_is_refused():
+    one = {"metadata": {"name": "etils", "version": "1.0", "requires_python": ">=3.13"}}
+    assert wheels.to_fetch([one], "3.13") == ["etils==1.0"]
+    with pytest.raises(
+        ValueError, match=r"etils==1.0 requires Python >=3.13, and --python is 3.12"
+    ):
+        wheels.to_fetch([one], "3.12")
 
 
 def test_another_machine_is_named_to_pip():

@@ -140,7 +140,10 @@ def test_figures_of_a_gpu_are_those_of_its_files(tmp_path: pathlib.Path):
     machine = {"machine": {"device": "H100"}}
 
     def judged(*rates: float) -> dict[str, object]:
-        rows = [{"minutes": 1.25 * (i + 1), "rate": rate} for i, rate in enumerate(rates)]
+        rows = [
+            {"minutes": 1.25 * (i + 1), "rate": rate, "env_steps": 9_000_000 * (i + 1)}
+            for i, rate in enumerate(rates)
+        ]
         return {"cell": "a", "judged": rows, **machine}
 
     def write(file: str, *rows: dict[str, object]) -> None:
@@ -150,13 +153,30 @@ def test_figures_of_a_gpu_are_those_of_its_files(tmp_path: pathlib.Path):
     # The second run was stopped before; the third one failed.
     write("train-a", judged(0.5, 0.95, 0.97), judged(0.5, 0.9), {"failed": "no memory", **machine})
     rate = {"cell": "physics+render at 8192", "steps_per_s": 512_345, **machine}
-    write("throughput", rate, rate | {"cell": "training at 8192", "steps_per_s": 1})
+    write("throughput", rate, rate | {"cell": "training and driving at 8192", "steps_per_s": 1})
     text = render("gpu", tmp_path)
     assert "| 3 minutes | 2.5 minutes, 90 % in 2.5 minutes | H100 |" in text
     assert "| environment B to 90 % | 5 minutes | not measured |" in text
     assert "| 400,000 steps/s | 512,345 steps/s | H100 |" in text
+    assert "| images and a motion beside those of a CPU | equal | not measured |" in text
+    # From the first evaluation to the last: 18 and 9 million steps in 2.5 and 1.25 minutes.
+    assert "| 100,000 steps/s | 120,000 steps/s, 120,000 steps/s | H100 |" in text
     # That one trains on fewer samples for each step than the preset.
     assert "| training of 8,192 environments | 100,000 steps/s | not measured |" in text
+
+
+def test_a_gpu_is_compared_with_a_cpu(tmp_path: pathlib.Path):
+    row = {
+        "share_of_pixels_of_another_geom": 0.0005,
+        "largest_difference_of_colour": 2,
+        "largest_difference_of_qpos": {"native": 3e-6, "mjx": 2e-7},
+        "machine": {"device": "H100"},
+    }
+    (tmp_path / "gpu").mkdir()
+    (tmp_path / "gpu" / "parity.json").write_text(json.dumps({"rows": [row]}))
+    text = render("gpu", tmp_path)
+    assert "| 0.050 % of the pixels show another geom, the others differ by 2 of 255" in text
+    assert "qpos by 3e-06 rad or m after 20 iterations | H100 |" in text
 
 
 def test_processes_are_compared(tmp_path: pathlib.Path):

@@ -59,6 +59,8 @@ DISTILL = set_train_options(
         "teacher_batch_size": 16,
         "student_batch_size": 8,
         "student_starts": 160,
+        # 24 images in each of the 20 steps of a chunk: the student drives from the third chunk on.
+        "student_warm_up": 480,
     },
 )
 
@@ -140,8 +142,6 @@ def training() -> dict:
 
 def distillation() -> dict:
     """A training from pixels, until the student has driven its environments for two chunks."""
-    # The student drives from the third chunk on, instead of 100,000 steps later.
-    distill._WARM_UP = DISTILL.chunk_steps
     mesh = make_mesh(jax.device_count())
     trainer, alone = make_trainer(DISTILL, mesh=mesh), make_trainer(DISTILL)
     state, rows = trainer.start(), []
