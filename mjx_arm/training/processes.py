@@ -11,13 +11,14 @@ import os
 import pathlib
 import sys
 import threading
-import time
 from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax
 import numpy as np
 from jax.experimental import multihost_utils
+
+from mjx_arm.training import meeting
 
 # The processes meet so often, and one that does not come for so long is lost, seconds.
 _PERIOD, _SILENCE = 5, 30
@@ -117,12 +118,13 @@ def _initialize(**options: Any) -> None:
     # Its handler of SIGTERM would take the place of ours, which saves at the end of a chunk.
     jax.config.update("jax_enable_preemption_service", False)
     try:
-        jax.distributed.initialize(
-            **options,
-            initialization_timeout=_START,
-            heartbeat_timeout_seconds=_HEARTBEAT,
-            shutdown_timeout_seconds=_END,
-        )
+        with meeting.apart():
+            jax.distributed.initialize(
+                **options,
+                initialization_timeout=_START,
+                heartbeat_timeout_seconds=_HEARTBEAT,
+                shutdown_timeout_seconds=_END,
+            )
     except Exception as error:
         reason = " ".join(str(error).split())[:200]
         raise ValueError(
@@ -196,8 +198,7 @@ def wait_for_all() -> None:
 def watch_others() -> None:
     """Ends this process with one sentence where another one is lost, in a thread of its own.
 
-    A collective waits for a lost process for ever. When process 0 is lost, which hosts the meeting,
-    jax ends the others at once and in its own words.
+    A collective waits for a lost process for ever.
     """
     if alone():
         return
@@ -242,10 +243,7 @@ def end_together(status: int) -> None:
         _ending.set()
         jax.distributed.shutdown()
         return
-    # At exit jax would wait for processes that may be lost. Process 0 hosts the meeting: the others
-    # print what they have to say before jax ends them with it.
-    if is_writer():
-        time.sleep(2)
+    # At exit jax would wait for processes that may be lost.
     for stream in (sys.stdout, sys.stderr):
         stream.flush()
     os._exit(status)

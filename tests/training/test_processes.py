@@ -349,7 +349,7 @@ def test_two_killed_processes_are_resumed_by_two(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "lost", [pytest.param(0, marks=pytest.mark.long), pytest.param(1, marks=pytest.mark.slow)]
+    "lost", [pytest.param(0, marks=pytest.mark.slow), pytest.param(1, marks=pytest.mark.long)]
 )
 def test_when_a_process_is_lost_the_others_end_and_the_run_resumes_with_one(lost, tmp_path):
     folder = tmp_path / "run"
@@ -358,12 +358,9 @@ def test_when_a_process_is_lost_the_others_end_and_the_run_resumes_with_one(lost
     started[lost].kill()
     left = started[1 - lost]
     _, error = left.communicate(timeout=60)
-    assert left.returncode != 0
-    assert "Traceback" not in error
-    if lost == 1:
-        # jax itself ends the others, in its own words, when process 0 is lost.
-        assert "have lost one another" in error
-        assert error.count("\n") == 1
+    assert left.returncode == 2
+    assert "have lost one another" in error
+    assert error.count("\n") == 1
     finish([started[lost]])
     done = RunCheckpoints(folder).steps()[-1] * 8
     arguments = ["--resume", str(folder), "--total-steps", str(done + 320), "--eval-episodes", "4"]
