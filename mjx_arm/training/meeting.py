@@ -61,13 +61,16 @@ class Meeting:
         said = self.process.stdout.readline().strip()
         if said != _READY:
             self.process.kill()
+            self.process.communicate()
             raise RuntimeError(said or "the coordination service did not start")
 
     def shutdown(self) -> None:
         """Ends the service, once the processes have left it."""
         with contextlib.suppress(OSError, subprocess.TimeoutExpired):
             self.process.communicate(f"{_END}\n", timeout=_STAY)
+            return
         self.process.kill()
+        self.process.communicate()
 
 
 @contextlib.contextmanager
