@@ -15,6 +15,8 @@ import time
 import jax
 import numpy as np
 import pytest
+from made_runs import make_run
+from quick_run import REPLACED
 
 from mjx_arm.cli import main
 from mjx_arm.config import set_train_options
@@ -89,18 +91,25 @@ def command(*arguments: str) -> list[str]:
     return [sys.executable, "-m", "mjx_arm", "train", *arguments]
 
 
+def train(*arguments: str) -> None:
+    """A run without its last evaluation and its pictures."""
+    with pytest.MonkeyPatch.context() as patch:
+        for module, name, function in REPLACED:
+            patch.setattr(module, name, function)
+        assert main(["train", *arguments]) == 0
+
+
 @pytest.fixture(scope="module")
 def whole_run(tmp_path_factory) -> pathlib.Path:
     folder = tmp_path_factory.mktemp("whole") / "run"
-    assert main(["train", *OPTIONS, "--total-steps", "4000", "--out", str(folder)]) == 0
+    train(*OPTIONS, "--total-steps", "4000", "--out", str(folder))
     return folder
 
 
 def test_more_steps_after_the_end_are_those_of_a_longer_run(whole_run, tmp_path):
     folder = tmp_path / "run"
-    assert main(["train", *OPTIONS, "--total-steps", "2000", "--out", str(folder)]) == 0
-    arguments = ["--resume", str(folder), "--total-steps", "4000", "--eval-episodes", "4"]
-    assert main(["train", *arguments]) == 0
+    train(*OPTIONS, "--total-steps", "2000", "--out", str(folder))
+    train("--resume", str(folder), "--total-steps", "4000", "--eval-episodes", "4")
     assert_same_run(folder, whole_run)
 
 
@@ -171,25 +180,21 @@ def test_a_run_that_has_saved_nothing_yet_begins_again(whole_run, tmp_path):
     assert_same_run(folder, whole_run)
 
 
-def test_a_run_whose_checkpoints_are_gone_does_not_begin_again(whole_run, tmp_path, capsys):
+@pytest.mark.parametrize("chunks", [20, 2], ids=["a whole run", "one that ended early"])
+def test_a_run_whose_checkpoints_are_gone_does_not_begin_again(chunks, whole_run, tmp_path, capsys):
     folder = tmp_path / "run"
     shutil.copytree(whole_run, folder)
     shutil.rmtree(folder / "checkpoints")
-    assert_refused_and_untouched(folder, "holds no checkpoint to continue from", capsys)
-
-
-def test_a_short_run_whose_checkpoints_are_gone_does_not_begin_again(tmp_path, capsys):
-    folder = tmp_path / "run"
-    short = ["--total-steps", "400", "--out", str(folder)]
-    assert main(["train", *OPTIONS, *short]) == 0
-    shutil.rmtree(folder / "checkpoints")
+    lines = (folder / "metrics.jsonl").read_text().splitlines(keepends=True)
+    assert len(lines) == 20
+    # Before its first checkpoint a run begins again; one that has left agents does not.
+    (folder / "metrics.jsonl").write_text("".join(lines[:chunks]))
     assert_refused_and_untouched(folder, "holds no checkpoint to continue from", capsys)
 
 
 def test_one_seed_of_several_is_not_resumed_alone(tmp_path, capsys):
     folder = tmp_path / "run"
-    short = ["--total-steps", "400", "--num-seeds", "2", "--out", str(folder)]
-    assert main(["train", *OPTIONS, *short]) == 0
+    make_run(folder, successes=(90, 91))
     message = f"is one seed of several: give the folder of all, {folder}"
     assert_refused_and_untouched(folder / "seed-0", message, capsys)
 
