@@ -200,30 +200,35 @@ class _Loop:
         action, refused = self._choose(best), None
         if action < 2 * len(angles):
             refused = self.guard.refuses(angles, action // 2, self._step(action))
-        if refused is None and not self.config.dry_run and not self.stop.is_set():
-            self._send(action)
-        sent = clock.now()
-        tally.refused += refused is not None
-        tally.inference_ms.append(inference_ms)
-        tally.image_age_ms.append(1000 * (sent - frame.time))
-        late = sent > deadline
-        tally.misses += late
-        self.log.write(
-            {
-                "tick": tick,
-                "time": began,
-                "image_number": frame.number,
-                "image_age_ms": tally.image_age_ms[-1],
-                "inference_ms": inference_ms,
-                "angles": angles,
-                "q": q,
-                "best": best,
-                "action": action,
-                "refused": refused,
-                "late": late,
-                "image": frame.image,
-            }
-        )
+        sends = refused is None and not self.config.dry_run and not self.stop.is_set()
+        try:
+            if sends:
+                self._send(action)
+        finally:
+            # Also where the robot fails in the middle: the log then has the command that it got.
+            sent = clock.now()
+            tally.refused += refused is not None
+            tally.inference_ms.append(inference_ms)
+            tally.image_age_ms.append(1000 * (sent - frame.time))
+            late = sent > deadline
+            tally.misses += late
+            self.log.write(
+                {
+                    "tick": tick,
+                    "time": began,
+                    "image_number": frame.number,
+                    "image_age_ms": tally.image_age_ms[-1],
+                    "inference_ms": inference_ms,
+                    "angles": angles,
+                    "q": q,
+                    "best": best,
+                    "action": action,
+                    "sent": sends,
+                    "refused": refused,
+                    "late": late,
+                    "image": frame.image,
+                }
+            )
         return late
 
     def _check_frame(self, frame: Frame) -> None:

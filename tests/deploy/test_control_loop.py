@@ -133,6 +133,7 @@ def test_a_dry_run_sends_nothing(run) -> None:
     made = run(dry_run=True)
     assert made.outcome.ticks == 25
     assert made.robot.told == []
+    assert not any(tick["sent"] for tick in read_log(made.path).ticks)
 
 
 def test_the_task_may_be_done(run) -> None:
@@ -146,7 +147,9 @@ def test_the_joints_stay_in_their_range(run) -> None:
     made = run(actions=[3], seconds=2.0)
     assert made.robot.angles.tolist() == [0.0, 20.0]
     assert made.outcome.refused == 50 - 10
-    assert read_log(made.path).ticks[-1]["refused"] == "joint 1 would leave its range"
+    ticks = read_log(made.path).ticks
+    assert [tick["sent"] for tick in ticks] == [True] * 10 + [False] * 40
+    assert ticks[-1]["refused"] == "joint 1 would leave its range"
 
 
 def test_the_gripper_stays_in_its_box(run, guard) -> None:
@@ -235,11 +238,12 @@ def test_a_robot_that_is_gone_ends_the_loop(run) -> None:
     assert made.outcome.ending == "fault"
     assert made.outcome.reason == "the robot is gone"
     assert len(made.robot.told) == 3
-    assert made.outcome.ticks == len(made.outcome.inference_ms) == 3
-    assert len(made.outcome.image_age_ms) == 3
+    # The fourth command is the one that the robot did not take: the log has it.
+    assert made.outcome.ticks == len(made.outcome.inference_ms) == 4
+    assert len(made.outcome.image_age_ms) == 4
     log = read_log(made.path)
     assert log.end == "the robot is gone"
-    assert len(log.ticks) == 3
+    assert [tick["sent"] for tick in log.ticks] == [True] * 4
 
 
 def test_what_is_not_foreseen_still_stops_the_arm(run, tmp_path) -> None:
