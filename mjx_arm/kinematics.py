@@ -108,7 +108,9 @@ def make_kinematics(
             site_xpos=_stack(site_xpos).reshape(-1, 3),
         )
 
-    return kinematics
+    # Traced once for each shape, however many programs call it.
+    traced_once: Kinematics = jax.jit(kinematics)
+    return traced_once
 
 
 def make_camera_pose(

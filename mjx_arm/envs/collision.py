@@ -254,7 +254,8 @@ def _make_clearances(
         solid = _between(one[planes:], other[planes:])
         return jnp.concatenate([flat, solid]).T
 
-    once = _called_once(many)
+    # Traced once for each shape, however many programs call it.
+    once = _called_once(jax.jit(many))
 
     def clearances(poses: Poses) -> jax.Array:
         if not len(pairs):
