@@ -62,7 +62,9 @@ class Meeting:
         if said != _READY:
             self.process.kill()
             self.process.communicate()
-            raise RuntimeError(said or "the coordination service did not start")
+            # Where the port is in use, jaxlib sometimes crashes before it can say so.
+            reason = said or "the port may be in use"
+            raise RuntimeError(f"the coordination service did not start on {address}: {reason}")
 
     def shutdown(self) -> None:
         """Ends the service, once the processes have left it."""
