@@ -82,6 +82,10 @@ def resolve(python: str, jax: str, needed: Iterable[str]) -> list[dict[str, Any]
 def to_fetch(resolved: list[dict[str, Any]], python: str) -> list[str]:
     """Names and versions of what the image lacks.
 
+    Args:
+      resolved: from `resolve`.
+      python: version on the other machine, such as `3.12`.
+
     Raises:
       ValueError: one of them does not run on that version of Python.
     """

@@ -43,6 +43,7 @@ class Meeting:
           number: processes that meet.
           heartbeat_timeout: a process that is silent for so long is lost, seconds.
           shutdown_timeout: so long the processes wait for one another at the end, seconds.
+          _: what else jax passes, which is left at its default.
 
         Raises:
           RuntimeError: the service did not start.
@@ -79,7 +80,8 @@ class Meeting:
 def apart() -> Iterator[None]:
     """Within it, `jax.distributed.initialize` starts the service in a process of its own.
 
-    Where jax starts it by another function than in jax 0.10 to 0.12, it stays in process 0.
+    The function of jax that is replaced is not a public one. Where it is missing, the service
+    starts in process 0, as jax does it.
     """
     from jax._src.lib import _jax
 
@@ -93,7 +95,7 @@ def apart() -> Iterator[None]:
 
 def _serve(address: str, number: str, heartbeat: str, shutdown: str) -> None:
     """Runs the service until process 0 says that it is over, or for a while after it is lost."""
-    for each in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1):
+    for each in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1, signal.SIGUSR2):
         signal.signal(each, signal.SIG_IGN)
     from jaxlib import _jax
 

@@ -241,7 +241,7 @@ def test_microbatches_give_the_update_of_the_whole_batch(monkeypatch):
 def test_the_student_drives_its_share_evenly(share, num_envs, driven):
     toy = make_toy(num_envs, student_share=share, student_starts=100)
     images = toy.config.student_batch_size * toy.config.student_updates_per_step
-    # As many images as are learnt from in 80 steps of the environments.
+    # The student learns from these images in 80 environment steps.
     toy = dataclasses.replace(
         toy, config=dataclasses.replace(toy.config, student_warm_up=80 // num_envs * images)
     )
@@ -318,7 +318,7 @@ def test_the_teacher_may_have_several_updates_in_a_step(run):
     key, replay, steps = jax.random.key(5), states[2].replay, jnp.int32(0)
     pair, counts = jax.jit(several.learn)(key, states[2].learner, replay, steps)
     assert counts["updates"] == 2
-    one = dataclasses.replace(trainer.algorithm, config=with_options(CONFIG).algo)
+    one = trainer.algorithm
     keys = jax.random.split(jax.random.split(key)[0], 2)
     config, frames = CONFIG.algo, one.frames
     expected = states[2].learner.teacher
@@ -328,8 +328,8 @@ def test_the_teacher_may_have_several_updates_in_a_step(run):
         expected = one.teacher.update(expected, batch, *features)[0]
     for leaf, other in zip(*map(jax.tree.leaves, (pair.teacher, expected)), strict=True):
         np.testing.assert_allclose(leaf, other, rtol=1e-5, atol=1e-6)
-    config = with_options(CONFIG, teacher_updates_per_step=2)
-    assert config.samples_per_step == 2 * CONFIG.samples_per_step
+    twice = with_options(CONFIG, teacher_updates_per_step=2)
+    assert twice.samples_per_step == 2 * CONFIG.samples_per_step
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,7 @@ LENGTH = 500
     ("name", "physics", "num_envs"),
     [
         ("A", "native", 1),
-        ("B", "native", 500),
+        ("B", "native", 1000),
         pytest.param("A", "mjx", 1, marks=pytest.mark.slow),
         pytest.param("B", "mjx", 50, marks=pytest.mark.slow),
     ],
