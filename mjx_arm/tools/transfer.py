@@ -56,6 +56,9 @@ class Outcomes:
         which it was closed; None where there were none.
       closed: share of the episodes that reached the cube with the gripper open, in which it was
         closed there at least once; None where there were none.
+      closed_at: median distance from the cube's centre at which the gripper was closed and then
+        grasped the cube, m; None where it never did. An agent that closes further out than 3 cm
+        succeeds with a `close_rate` of 0.
       grasped: share of the episodes in which the cube was grasped at some time.
       dropped: share of the episodes in which the cube was lost at a height of 1 cm or more.
       mean_length: iterations of an episode, failures included.
@@ -68,6 +71,7 @@ class Outcomes:
     reached: float
     close_rate: float | None
     closed: float | None
+    closed_at: float | None
     grasped: float
     dropped: float
     mean_length: float
@@ -80,8 +84,12 @@ def summarise(traces: Sequence[Trace], env: Env) -> Outcomes:
       traces: at least one.
       env: the environment of the actions.
     """
-    near = [_open_near(trace, env) for trace in traces]
+    is_open = [_is_open(trace, env) for trace in traces]
+    near = [x & (t.distance[:-1] <= NEAR_CUBE) for x, t in zip(is_open, traces, strict=True)]
     closes = [x & (t.action == env.arm.close_action) for x, t in zip(near, traces, strict=True)]
+    closed_at = [
+        float(t.distance[i]) for x, t in zip(is_open, traces, strict=True) for i in _grasps(x, t)
+    ]
     open_there = sum(int(x.sum()) for x in near)
     reached_open = sum(bool(x.any()) for x in near)
     episodes, successes = len(traces), sum(trace.success for trace in traces)
@@ -97,14 +105,15 @@ def summarise(traces: Sequence[Trace], env: Env) -> Outcomes:
         reached=share(lambda t: ((t.distance <= NEAR_CUBE) | t.grasped).any()),
         close_rate=sum(int(x.sum()) for x in closes) / open_there if open_there else None,
         closed=sum(bool(x.any()) for x in closes) / reached_open if reached_open else None,
+        closed_at=float(np.median(closed_at)) if closed_at else None,
         grasped=share(lambda t: t.grasped.any()),
         dropped=share(_dropped),
         mean_length=float(np.mean([len(trace.action) for trace in traces])),
     )
 
 
-def _open_near(trace: Trace, env: Env) -> np.ndarray:
-    """Iterations that begin with the open gripper at the cube, `[L] bool`.
+def _is_open(trace: Trace, env: Env) -> np.ndarray:
+    """Iterations that begin with the open gripper, `[L] bool`.
 
     The gripper is open at the start unless the cube is grasped there; see `LiftConfig.start`.
     """
@@ -113,7 +122,18 @@ def _open_near(trace: Trace, env: Env) -> np.ndarray:
     for i, action in enumerate(trace.action):
         opened[i] = is_open
         is_open = (is_open or action == arm.open_action) and action != arm.close_action
-    return opened & (trace.distance[:-1] <= NEAR_CUBE)
+    return opened
+
+
+def _grasps(is_open: np.ndarray, trace: Trace) -> list[int]:
+    """Iterations that closed the gripper, after which it had the cube before it opened again."""
+    grasps = []
+    for i in np.nonzero(is_open[:-1] & ~is_open[1:])[0]:
+        opened = np.nonzero(is_open[i + 1 :])[0]
+        end = i + 1 + opened[0] if len(opened) else len(trace.grasped)
+        if trace.grasped[i + 1 : end].any():
+            grasps.append(int(i))
+    return grasps
 
 
 def _dropped(trace: Trace) -> bool:
