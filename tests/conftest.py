@@ -6,6 +6,7 @@ import os
 import shutil
 import sys
 import tempfile
+from collections.abc import Iterator
 
 # MuJoCo chooses its OpenGL when it is imported, and fails to import where it cannot find it.
 if sys.platform.startswith("linux"):
@@ -30,6 +31,31 @@ jax.config.update("jax_compilation_cache_dir", os.environ[_CACHE])
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
 # A limit in bytes makes jax lock the folder: no worker reads what another one is still writing.
 jax.config.update("jax_compilation_cache_max_size", 2**33)
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Lets the default tests, and the processes that they start, compile with few optimisations.
+
+    They then take 10 minutes instead of 18 on two cores. Tests with the markers `slow` and `long`
+    compile as the product does.
+    """
+    if "not slow" not in config.option.markexpr:
+        return
+    os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = "1"
+    jax.config.update("jax_disable_most_optimizations", True)
+    # From jax 0.11 on XLA does not know this flag, and aborts.
+    if jax.__version_info__ < (0, 11):
+        flags = os.environ.get("XLA_FLAGS", "")
+        os.environ["XLA_FLAGS"] = f"--xla_cpu_use_fusion_emitters=false {flags}".rstrip()
+
+
+@pytest.fixture
+def optimised() -> Iterator[None]:
+    """Optimises what a test compiles, for two programs that are to agree in every bit."""
+    before = jax.config.read("jax_disable_most_optimizations")
+    jax.config.update("jax_disable_most_optimizations", False)
+    yield
+    jax.config.update("jax_disable_most_optimizations", before)
 
 
 @pytest.fixture(scope="session")

@@ -22,6 +22,7 @@ def test_shapes_and_dtypes(arm: Scene) -> None:
     assert (depth.shape, depth.dtype) == ((24, 48), jnp.float32)
 
 
+@pytest.mark.usefixtures("optimised")
 def test_depth_and_flat_matrices_do_not_change_the_image(arm: Scene) -> None:
     data = at(arm.mj_model, random_qpos(arm.mj_model, 1, seed=14)[0])
     plain = make_renderer(arm)(data.geom_xpos, data.geom_xmat.reshape(-1, 3, 3))
