@@ -22,6 +22,9 @@ from mjx_arm.varies import Params
 # that is below 1e-9.
 MAX_SAMPLES = 32
 
+# Folded into the key of a start for what its task makes easier.
+_EASE = 1
+
 # Key, joints, number of samples, whether the last one is free.
 _Sample: TypeAlias = tuple[jax.Array, jax.Array, jax.Array, jax.Array]
 
@@ -64,7 +67,7 @@ class StartSampler:
         """
         home = jnp.asarray(self.arm.home_qpos[self.arm.qpos])
         if self.config.noise_degrees == 0.0:
-            return *self._assemble(home, placement), jnp.ones((), jnp.int32)
+            return *self._eased(key, home, placement), jnp.ones((), jnp.int32)
         degrees = self.config.noise_degrees
         noise = np.where(self.arm.slides, degrees / 1000.0, np.deg2rad(degrees)).astype(np.float32)
         low, high = self.arm.ctrl_range[self.arm.ctrl].T
@@ -82,7 +85,15 @@ class StartSampler:
 
         first = (key, home, jnp.zeros((), jnp.int32), jnp.zeros((), jnp.bool_))
         _, joints, samples, free = jax.lax.while_loop(unfinished, sample_again, first)
-        return *self._assemble(jnp.where(free, joints, home), placement), samples
+        return *self._eased(key, jnp.where(free, joints, home), placement), samples
+
+    def _eased(
+        self, key: jax.Array, joints: jax.Array, placement: Placement
+    ) -> tuple[jax.Array, jax.Array, Params]:
+        qpos, ctrl, params = self._assemble(joints, placement)
+        if hasattr(self.task, "ease"):
+            qpos, ctrl = self.task.ease(jax.random.fold_in(key, _EASE), qpos, ctrl)
+        return qpos, ctrl, params
 
     def _is_free(self, joints: jax.Array, placement: Placement) -> jax.Array:
         qpos, _, params = self._assemble(joints, placement)

@@ -102,6 +102,23 @@ class SizedTask(Task, Protocol):
         ...
 
 
+class EasedTask(Task, Protocol):
+    """A task that can make some starts easier: a curriculum over the starts."""
+
+    def ease(self, key: jax.Array, qpos: jax.Array, ctrl: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Changes a start whose arm is free. Consumes the key.
+
+        Args:
+          key: a PRNG key.
+          qpos: `[nq] float32`.
+          ctrl: `[nu] float32`.
+
+        Returns:
+          `qpos` and `ctrl`.
+        """
+        ...
+
+
 def rectangle(scene: Scene, name: str) -> tuple[np.ndarray, np.ndarray]:
     """Centre and half extents, `[2] float32` each, m, of a scene's numeric `x y half_x half_y`.
 

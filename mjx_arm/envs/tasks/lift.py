@@ -18,7 +18,7 @@ from mjx_arm.envs.collision import Obstacle
 from mjx_arm.envs.state import EnvState, Snapshot
 from mjx_arm.envs.tasks.base import Reward, TaskConfig, rectangle
 from mjx_arm.kinematics import Poses, make_kinematics
-from mjx_arm.options import Positive, options
+from mjx_arm.options import Positive, Share, options
 from mjx_arm.scene import Scene
 from mjx_arm.varies import Params, Varies
 
@@ -43,6 +43,9 @@ class LiftConfig(TaskConfig):
     Attributes:
       lift: height that the cube must be lifted to, above its rest, m.
       start: `home`, or `in_grasp` with the cube in the closed gripper.
+      in_grasp_share: of the episodes that start at `home`, the share in which the closed gripper
+        has the cube already, at whatever height the arm starts. A curriculum: the learner finds
+        out what a lift pays before it can grasp.
       rectangle_scale: factor on the edges of the rectangle in which the cube's places are sampled.
         An agent that trains with more than 1 has seen the places to which a cube is knocked.
       success_reward: paid once, on success.
@@ -58,6 +61,7 @@ class LiftConfig(TaskConfig):
 
     lift: Positive = 0.3
     start: Literal["home", "in_grasp"] = "home"
+    in_grasp_share: Share = 0.0
     rectangle_scale: Positive = 1.0
     success_reward: float = 100.0
     distance_decay: Positive = 0.25
@@ -135,20 +139,31 @@ class Lift:
         self, qpos: jax.Array, ctrl: jax.Array, placement: jax.Array
     ) -> tuple[jax.Array, jax.Array, Params]:
         """Puts the cube on its place, or into the gripper, which is closed then."""
+        if self.config.start == "in_grasp":
+            return *self._grasp(qpos, ctrl), {}
+        qpos = qpos.at[self.cube_qpos : self.cube_qpos + 2].set(placement)
+        if isinstance(self._half, jax.Array):
+            # Higher or lower than the scene has it, by what the cube is larger or smaller.
+            qpos = qpos.at[self.cube_qpos + 2].add(self._half - self.half_size)
+        return qpos, ctrl, {}
+
+    def ease(self, key: jax.Array, qpos: jax.Array, ctrl: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Puts the cube into the gripper in some episodes; see `LiftConfig.in_grasp_share`."""
+        if self.config.in_grasp_share == 0.0 or self.config.start == "in_grasp":
+            return qpos, ctrl
+        eased = jax.random.bernoulli(key, self.config.in_grasp_share)
+        held = self._grasp(qpos, ctrl)
+        return jnp.where(eased, held[0], qpos), jnp.where(eased, held[1], ctrl)
+
+    def _grasp(self, qpos: jax.Array, ctrl: jax.Array) -> tuple[jax.Array, jax.Array]:
         arm, cube = self.arm, slice(self.cube_qpos, self.cube_qpos + 7)
-        if self.config.start == "home":
-            qpos = qpos.at[self.cube_qpos : self.cube_qpos + 2].set(placement)
-            if isinstance(self._half, jax.Array):
-                # Higher or lower than the scene has it, by what the cube is larger or smaller.
-                qpos = qpos.at[self.cube_qpos + 2].add(self._half - self.half_size)
-            return qpos, ctrl, {}
         qpos = qpos.at[arm.finger_qpos].set(_f32(self._half - _SQUEEZE))
         ctrl = ctrl.at[arm.gripper_ctrl].set(arm.ctrl_range[arm.gripper_ctrl, 0])
         poses = self._kinematics(qpos)
         # The pads have no rotation of their own, so theirs is the finger's; see `_check_fingers`.
         gripper = Rotation.from_matrix(poses.geom_xmat[self.pad_geoms[0, 0]])
         pose = [poses.site_xpos[arm.grasp_site], gripper.as_quat(scalar_first=True)]
-        return qpos.at[cube].set(jnp.concatenate(pose)), ctrl, {}
+        return qpos.at[cube].set(jnp.concatenate(pose)), ctrl
 
     def accepts(self, poses: Poses, placement: jax.Array) -> jax.Array:
         """Every start with a free arm fits."""

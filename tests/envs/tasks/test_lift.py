@@ -284,3 +284,49 @@ def test_another_body_than_a_cube_is_refused_by_name(tmp_path, change, message):
     with pytest.raises(ValueError, match=message) as raised:
         mjx_arm.make("A", scene=str(path))
     assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize("name", ["A", "B"])
+def test_a_share_of_the_starts_has_the_cube_in_the_gripper(name):
+    envs = {
+        share: mjx_arm.make(name, physics="native", observation="state", in_grasp_share=share)
+        for share in (0.0, 0.25)
+    }
+    keys = jax.random.split(jax.random.key(3), 400)
+
+    def starts(share: float):
+        env = envs[share]
+        state = jax.jit(jax.vmap(env.reset))(keys)[1]
+        return state, jax.vmap(env.task.measure)(state)
+
+    plain, measured = starts(0.0)
+    assert not measured["grasped"].any()
+    state, measured = starts(0.25)
+    eased = np.asarray(measured["grasped"])
+    assert 70 < eased.sum() < 130
+    # The others are the starts that they were, and the arm is where it was in all of them.
+    for field in ("qpos", "ctrl"):
+        before, after = (
+            np.asarray(getattr(x, field) if field == "ctrl" else x.physics.qpos)
+            for x in (plain, state)
+        )
+        np.testing.assert_allclose(after[~eased], before[~eased], atol=1e-6)
+    joints = envs[0.0].arm.qpos
+    before, after = plain.physics.qpos[:, joints], state.physics.qpos[:, joints]
+    np.testing.assert_allclose(after, before, atol=1e-6)
+    assert np.all(np.asarray(measured["distance"])[eased] < 1e-3)
+
+
+def test_the_next_episode_is_eased_by_its_own_key():
+    env = mjx_arm.make("A", physics="native", observation="state", in_grasp_share=0.5)
+    _, state = jax.jit(env.reset)(jax.random.key(0))
+    again = jax.jit(jax.vmap(env.restart, (0, None)))(
+        jax.random.split(jax.random.key(1), 64), state
+    )
+    assert 16 < jax.vmap(env.task.measure)(again)["grasped"].sum() < 48
+
+
+@pytest.mark.parametrize("share", [-0.1, 1.5, "half"])
+def test_a_share_that_is_none_is_refused(share):
+    with pytest.raises(ValueError, match="in_grasp_share must be a finite number from 0 to 1"):
+        mjx_arm.make("A", in_grasp_share=share)
