@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 T = TypeVar("T")
 
@@ -45,11 +47,11 @@ class Shard:
 
     def mean(self, tree: T) -> T:
         """The mean over the parts of each array of a tree."""
-        return tree if self.axis is None else jax.lax.pmean(tree, self.axis)
+        return tree if self.axis is None else _as_one(tree, self.axis, jax.lax.pmean)
 
     def total(self, tree: T) -> T:
         """The sum over the parts of each array of a tree."""
-        return tree if self.axis is None else jax.lax.psum(tree, self.axis)
+        return tree if self.axis is None else _as_one(tree, self.axis, jax.lax.psum)
 
     def largest(self, tree: T) -> T:
         """The maximum over the parts of each array of a tree."""
@@ -64,3 +66,21 @@ class Shard:
 
 
 WHOLE = Shard()
+
+
+def _as_one(tree: T, axis: str, reduce: Callable[[jax.Array, str], jax.Array]) -> T:
+    """Reduces all arrays of a type as one.
+
+    Between processes of CPUs each array is a message of its own, whatever its size: the gradients
+    of a network with 20 arrays took 17 ms as a tree and 4.4 ms as one array.
+    """
+    leaves, structure = jax.tree.flatten(jax.tree.map(jnp.asarray, tree))
+    reduced = list(leaves)
+    # In the order of the leaves, which is the same in every process.
+    for dtype in dict.fromkeys(x.dtype for x in leaves):
+        same = [i for i, x in enumerate(leaves) if x.dtype == dtype]
+        ends = np.cumsum([leaves[i].size for i in same])[:-1].tolist()
+        joined = reduce(jnp.concatenate([leaves[i].ravel() for i in same]), axis)
+        for i, part in zip(same, jnp.split(joined, ends), strict=True):
+            reduced[i] = part.reshape(leaves[i].shape)
+    return jax.tree.unflatten(structure, reduced)

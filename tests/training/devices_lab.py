@@ -179,6 +179,32 @@ def distillation() -> dict:
     }
 
 
+def exchange() -> dict:
+    """A tree of two types, averaged and added up over the devices: as one array of each type."""
+    mesh = make_mesh(4)
+    shard = shard_of(mesh)
+
+    def reduce(x):
+        tree = {"a": x, "b": {"c": 10.0 * x[0, 0], "d": jnp.ones((2, 3, 1)) + x[0, 0]}}
+        return shard.mean(tree), shard.total({"n": jnp.int32(2), "s": x[0]})
+
+    spread = jax.shard_map(
+        reduce, mesh=mesh, in_specs=P(shard.axis), out_specs=P(), check_vma=False
+    )
+    compiled = jax.jit(spread).lower(jnp.arange(8.0).reshape(4, 2)).compile()
+    mean, total = compiled(jnp.arange(8.0).reshape(4, 2))
+    return {
+        "mean": jax.tree.map(lambda x: x.tolist(), mean),
+        "total": jax.tree.map(lambda x: x.tolist(), total),
+        # XLA may join them further, to one operation on several arrays.
+        "arrays": sum(
+            line.split(" all-reduce(")[0].count("[")
+            for line in compiled.as_text().splitlines()
+            if " all-reduce(" in line
+        ),
+    }
+
+
 def samples() -> dict:
     """What each device samples from shards that all hold the same."""
     mesh = make_mesh(jax.device_count())

@@ -38,7 +38,7 @@ def four_devices(*checks: str, timeout: float = 600) -> dict:
 
 @pytest.fixture(scope="module")
 def lab() -> dict:
-    return four_devices("training", "samples", "updates")
+    return four_devices("training", "exchange", "samples", "updates")
 
 
 def test_every_step_of_every_device_is_counted(lab):
@@ -49,6 +49,14 @@ def test_every_step_of_every_device_is_counted(lab):
     assert sum(row["episodes"] for row in counts) == 8 * (60 // 16)
     assert 0 < counts[0]["updates"] < counts[-1]["updates"] == 20
     assert all(row["diverged"] == 0 for row in counts)
+
+
+def test_a_tree_is_exchanged_as_one_array_of_each_type(lab):
+    found = lab["exchange"]
+    # Of rows 0 1, 2 3, 4 5 and 6 7.
+    assert found["mean"] == {"a": [[3, 4]], "b": {"c": 30, "d": [[[4], [4], [4]], [[4], [4], [4]]]}}
+    assert found["total"] == {"n": 8, "s": [12, 16]}
+    assert found["arrays"] == 3  # the mean, and the totals of two types
 
 
 def test_environments_and_replay_are_spread_and_parameters_are_copied(lab):
