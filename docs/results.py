@@ -38,15 +38,13 @@ def render(name: str, folder: pathlib.Path = RESULTS) -> str:
 def _read(path: pathlib.Path) -> Any:
     """The content of a file, or of each file of a folder by its stem.
 
-    A folder, and what is not measured yet, may be missing, and is empty then.
+    A folder may be missing, and is empty then.
 
     Raises:
       FileNotFoundError: another file is missing.
     """
     if path.name in FOLDERS:
         return {each.stem: _read(each) for each in sorted(path.glob("*.json"))}
-    if path.name in NOT_YET and not path.is_file():
-        return {}
     return json.loads(path.read_text(encoding="utf-8"))
 
 
@@ -310,6 +308,33 @@ def _processes(content: Any) -> Table:
     return ["what", "steps/s, median", "all rounds", "share of the time for the exchange"], rows
 
 
+def _agents(content: Any) -> Table:
+    rows = []
+    for name, row in content.items():
+        low, high = row["mjx_minus_native"]["ci95"]
+        own, scripted = (row[f"median_length_{which}"] for which in ("agent", "scripted"))
+        rows.append(
+            [
+                f"`{name}`",
+                row["trained_in"],
+                *(f"{100 * row[f'in_{env}']['rate']:.1f} %" for env in ("A", "B")),
+                f"{own:g}; {scripted:g}",
+                f"{row['mjx_minus_native']['percent']:.1f} points ({low:.1f} to {high:.1f})",
+                f"{100 * row['blank_image']:g} %; {100 * row['image_of_another_episode']:g} %",
+                f"{row['machine']['cpu']}, {row['machine']['cores']} cores, "
+                f"{_versions(row['machine'])}",
+            ]
+        )
+    header = ["agent", "trained in", "success in A", "success in B"]
+    header += ["median length of a success: agent; scripted policy"]
+    header += [
+        "MJX minus native physics (95 % interval)",
+        "blank image; another episode's image",
+        "machine",
+    ]
+    return header, rows
+
+
 def _sizes(content: Any) -> list[int]:
     return sorted({row["num_envs"] for row in content["rows"]})
 
@@ -348,11 +373,10 @@ TABLES: dict[str, tuple[str, Callable[[Any], Table]]] = {
     "time-to-success-1": ("time_to_success.json", _time_to_success),
     "gpu": ("gpu", _gpu),
     "processes": ("processes.json", _processes),
+    "agents": ("agents.json", _agents),
 }
 # What `benchmarks/gpu.py` wrote. Git keeps no empty folder, so a missing one is an empty one.
 FOLDERS = ("gpu",)
-# Figures that nobody could take yet; their tables say so.
-NOT_YET = ("processes.json",)
 
 
 def setup(app: Any) -> dict[str, bool]:
