@@ -17,10 +17,10 @@ under two hours on two cores; `tests/benchmarks/test_campaign.py` tries each at 
 - `swaps`: a checkpoint is replaced by one of another step, run or seed, and a number of the
   configuration by another. All must be found.
 - `options`: generated configurations, valid and invalid, from the library and the command line.
-  Each must be accepted and come back from JSON as it was, or be refused in one sentence.
+  Each must be accepted and come back from JSON as it was, or be rejected in one sentence.
 - `nans`: the controls of 1 % of the steps are NaN, for both storages of the replay. Those steps
   must be counted as diverged, and all parameters stay finite.
-- `locks`: two processes start in one folder at once. One must train, the other refuse.
+- `locks`: two processes start in one folder at once. One must train, the other reject.
 - `memory`: ten minutes of training must not need more and more memory.
 """
 
@@ -116,7 +116,7 @@ def in_process(*arguments: str | pathlib.Path) -> tuple[int, str, str]:
 
 
 def is_sentence(status: int, error: str) -> bool:
-    """Whether a refusal is one line, with exit status 2."""
+    """Whether a rejection is one line, with exit status 2."""
     return status == 2 and error.startswith("error: ") and error.count("\n") == 1
 
 
@@ -276,13 +276,13 @@ def flips(folder: pathlib.Path, scale: float) -> Iterator[Row]:
     def row(what: str, wanted: str) -> Row:
         return Row("flips", f"one bit of {what}", wanted)
 
-    refused, agent, config = (
-        "refused in one sentence",
+    rejected, agent, config = (
+        "rejected in one sentence",
         whole / AGENT_FILES[0],
         whole / "config.json",
     )
-    agents, checkpoints = row("an agent", refused), row("the newest checkpoint", refused)
-    configs = row("config.json", refused)
+    agents, checkpoints = row("an agent", rejected), row("the newest checkpoint", rejected)
+    configs = row("config.json", rejected)
     _flip_each(agents, agent, _places(agent, rng, round(200 * scale)), "eval", agent)
     yield agents
     newest = sorted((whole / "checkpoints").iterdir())[-1]
@@ -324,7 +324,7 @@ def flips(folder: pathlib.Path, scale: float) -> Iterator[Row]:
 def _flip_each(
     row: Row, path: pathlib.Path, places: list[int], *command: str | pathlib.Path
 ) -> None:
-    """Flips each bit of a file alone; the command must refuse the file each time."""
+    """Flips each bit of a file alone; the command must reject the file each time."""
     for place in places:
         with _flipped(path, place):
             status, _, error = in_process(*command)
@@ -370,7 +370,7 @@ def swaps(folder: pathlib.Path, scale: float) -> Iterator[Row]:
     run_to_end(one, STATE)
     run_to_end(other, [*STATE, "--seed", "1"])
     more = ("--total-steps", "4200", "--eval-episodes", "4")
-    row = Row("swaps", "a checkpoint of another step or run", "refused in one sentence")
+    row = Row("swaps", "a checkpoint of another step or run", "rejected in one sentence")
     steps = sorted((one / "checkpoints").iterdir())
     for source in (steps[0], *sorted((other / "checkpoints").iterdir())):
         own = folder / "swapped"
@@ -383,7 +383,7 @@ def swaps(folder: pathlib.Path, scale: float) -> Iterator[Row]:
         shutil.rmtree(own)
     yield row
 
-    row = Row("swaps", "a number in config.json", "refused in one sentence")
+    row = Row("swaps", "a number in config.json", "rejected in one sentence")
     path = one / "config.json"
     text = path.read_text()
     for keys, value in _numbers(json.loads(text)):
@@ -427,7 +427,7 @@ def options(folder: pathlib.Path, scale: float) -> Iterator[Row]:
     row = Row(
         "options",
         "a generated configuration, from the library",
-        "comes back from JSON as it was, or is refused in one sentence that names an option",
+        "comes back from JSON as it was, or is rejected in one sentence that names an option",
     )
     accepted = 0
     for _ in range(max(1, round(300 * scale))):
@@ -451,7 +451,7 @@ def options(folder: pathlib.Path, scale: float) -> Iterator[Row]:
     row = Row(
         "options",
         "a generated command line with an invalid value",
-        "refused in one sentence, exit status 2, nothing written",
+        "rejected in one sentence, exit status 2, nothing written",
     )
     texts = ["-1", "2.5", "nan", "inf", "1e400", "many", "", "0x10", "1,000", "--", "\udcff"]
     invalid = 0
@@ -533,7 +533,7 @@ def _with_nans(env: Any) -> Any:
 
 def locks(folder: pathlib.Path, scale: float) -> Iterator[Row]:
     """Starts two processes in one folder at once."""
-    row = Row("locks", "two processes in one folder", "one trains to its end, the other refuses")
+    row = Row("locks", "two processes in one folder", "one trains to its end, the other rejects")
     for i in range(max(1, round(10 * scale))):
         own = folder / f"run-{i}"
         pipes = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE}

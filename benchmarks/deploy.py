@@ -91,7 +91,7 @@ def measure(
         "missed_share": misses / ticks,
         "faults": faults,
         "watchdog": options.watchdog,
-        "refused": sum(x.refused for x in outcomes),
+        "rejected": sum(x.rejected for x in outcomes),
         "inference_ms": {
             "median": float(np.median(inference)),
             "p99": float(np.percentile(inference, 99)),

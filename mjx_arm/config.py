@@ -249,7 +249,7 @@ class TrainConfig:
     algo: AlgorithmConfig = dataclasses.field(default_factory=DQNConfig)
 
     def check(self) -> None:
-        """Refuses options that do not fit together."""
+        """Rejects options that do not fit together."""
         wanted = _ALGORITHMS[self.algorithm]
         if type(self.algo) is not wanted:
             raise ValueError(
@@ -280,7 +280,7 @@ class TrainConfig:
                 raise ValueError(f"replay_size must be at least {name} = {batch}, got {size}")
 
     def _check_edges(self) -> None:
-        """Refuses images of which the convolutions leave nothing."""
+        """Rejects images of which the convolutions leave nothing."""
         network = self.network
         edge = min(self.env.size)
         for layer, stride in enumerate(network.strides):

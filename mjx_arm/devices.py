@@ -8,7 +8,7 @@ import jax
 
 
 def check_device() -> None:
-    """Refuses a jax that has no device, or does not compile.
+    """Rejects a jax that has no device, or does not compile.
 
     Raises:
       ValueError: the device that `JAX_PLATFORMS` names is not there, or `JAX_DISABLE_JIT` is set.

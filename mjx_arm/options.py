@@ -2,7 +2,7 @@
 
 `@options` makes a class of options. Every value is checked when an object is made, also by
 `dataclasses.replace`: types are strict (2.0 is no whole number, True is no number), numbers are
-finite, unknown names are refused with the nearest known one.
+finite, unknown names are rejected with the nearest known one.
 """
 
 from __future__ import annotations
@@ -63,6 +63,14 @@ def options(cls: C) -> C:
             validate(self, **values)
         except pydantic.ValidationError as error:
             raise ValueError(_sentence(made, values, error)) from None
+        for name in option_names(made):
+            try:
+                hash(getattr(self, name))
+            except TypeError:
+                raise ValueError(
+                    f"{name} must be of a type that can be hashed, such as a tuple instead of a "
+                    f"list, got {type(getattr(self, name)).__name__}"
+                ) from None
         check = getattr(self, "check", None)
         if check is not None:
             check()
@@ -77,7 +85,7 @@ def _sentence(cls: type, values: Mapping[str, Any], error: pydantic.ValidationEr
 
 
 def check_value(name: str, annotation: Any, value: Any) -> None:
-    """Refuses an argument that its annotation does not allow, as for an option.
+    """Rejects an argument that its annotation does not allow, as for an option.
 
     Raises:
       ValueError: says what is allowed and what was given.
@@ -175,7 +183,7 @@ def _fields_of(cls: Any) -> dict[str, Any]:
 
 
 def check_name(what: str, name: str, known: Iterable[str], *, prefix: str = "") -> None:
-    """Refuses an unknown name, and offers the nearest known one.
+    """Rejects an unknown name, and offers the nearest known one.
 
     Args:
       what: what the name is of.

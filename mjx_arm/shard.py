@@ -17,8 +17,8 @@ T = TypeVar("T")
 class Shard:
     """One of the equal parts of a computation inside `jax.shard_map`; by default the whole.
 
-    For the whole each function returns its argument, so a program for one device has no trace of
-    them.
+    With the default each function returns its argument, so a program for one device has no extra
+    operations.
 
     Attributes:
       axis: name of the mesh axis, or None for the whole.
@@ -29,7 +29,7 @@ class Shard:
     count: int = 1
 
     def part(self, rows: int) -> int:
-        """Rows of each part, of a number of rows that `count` divides."""
+        """Rows of each part, of a total that `count` divides."""
         return rows // self.count
 
     def fold(self, key: jax.Array) -> jax.Array:
@@ -69,10 +69,10 @@ WHOLE = Shard()
 
 
 def _as_one(tree: T, axis: str, reduce: Callable[[jax.Array, str], jax.Array]) -> T:
-    """Reduces all arrays of a type as one.
+    """Joins all arrays of one dtype and reduces them in one message.
 
-    Between processes of CPUs each array is a message of its own, whatever its size: the gradients
-    of a network with 20 arrays took 17 ms as a tree and 4.4 ms as one array.
+    Between processes of CPUs each array would be a message of its own: the gradients of a network
+    with 20 arrays took 17 ms as a tree and 4.4 ms as one array.
     """
     leaves, structure = jax.tree.flatten(jax.tree.map(jnp.asarray, tree))
     reduced = list(leaves)

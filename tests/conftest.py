@@ -51,7 +51,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 @pytest.fixture
 def optimised() -> Iterator[None]:
-    """Optimises what a test compiles, for two programs that are to agree in every bit."""
+    """Compiles a test with XLA's optimisations, because it compares two programs bit for bit."""
     before = jax.config.read("jax_disable_most_optimizations")
     jax.config.update("jax_disable_most_optimizations", False)
     yield

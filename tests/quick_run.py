@@ -34,7 +34,7 @@ REPLACED = [
     (runner, "plot_curves", _plot_curves),
     (runner, "write_report", lambda folder, *rest: folder / "report.html"),
     (runner, "record_episode", lambda *args, **options: _NoFrames()),
-    (runner, "draw_episode", lambda *args: iter(())),
+    (runner, "render_episode", lambda *args: iter(())),
     (runner, "write_video", lambda *args: None),
 ]
 

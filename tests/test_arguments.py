@@ -1,4 +1,4 @@
-"""A command line means what its options' annotations say, and is refused in a sentence of ours."""
+"""A command line means what its options' annotations say, and is rejected in a sentence of ours."""
 
 from __future__ import annotations
 

@@ -254,14 +254,14 @@ def test_help_shows_the_values_of_the_preset(preset, capsys):
     assert f"(default: {PRESETS[preset].total_steps})" in text
 
 
-def test_warp_without_its_extra_is_refused(capsys, tmp_path):
+def test_warp_without_its_extra_is_rejected(capsys, tmp_path):
     if "warp" in sys.modules or __import__("importlib.util").util.find_spec("warp"):
         pytest.skip("the extra `warp` is installed")
     assert main(["train", "--physics", "mjx-warp", "--out", str(tmp_path / "run")]) == 2
     assert "extra 'warp'" in capsys.readouterr().err
 
 
-def test_an_output_folder_that_cannot_be_one_is_refused(capsys, tmp_path):
+def test_an_output_folder_that_cannot_be_one_is_rejected(capsys, tmp_path):
     file = tmp_path / "file"
     file.write_text("")
     full = tmp_path / "full"
@@ -269,8 +269,8 @@ def test_an_output_folder_that_cannot_be_one_is_refused(capsys, tmp_path):
     (full / "thesis.tex").write_text("")
     # Where nobody can make a folder, not even root.
     nowhere = pathlib.Path("/proc/self/mjx_arm")
-    refused = [(file, "is a file"), (full, "is not empty"), (nowhere, "cannot be made")]
-    for folder, message in refused[: 3 if sys.platform == "linux" else 2]:
+    rejected = [(file, "is a file"), (full, "is not empty"), (nowhere, "cannot be made")]
+    for folder, message in rejected[: 3 if sys.platform == "linux" else 2]:
         assert main(["train", *TINY, "--out", str(folder)]) == 2
         error = capsys.readouterr().err
         assert message in error
@@ -315,7 +315,7 @@ def test_play_writes_a_gif(run_folder, tmp_path, capsys):
     ("name", "message"),
     [("video.avi", "ends in '.avi'"), ("nowhere/video.mp4", "a folder that exists")],
 )
-def test_a_video_that_could_not_be_written_is_refused_first(
+def test_a_video_that_could_not_be_written_is_rejected_first(
     name, message, run_folder, tmp_path, capsys
 ):
     assert main(["play", str(run_folder), "--out", str(tmp_path / name)]) == 2
@@ -325,7 +325,7 @@ def test_a_video_that_could_not_be_written_is_refused_first(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_figures_of_a_run_without_metrics_are_refused(tmp_path, capsys):
+def test_figures_of_a_run_without_metrics_are_rejected(tmp_path, capsys):
     save_run(tmp_path, SavedRun(TrainConfig(), {}, load_scene("arm_cube").source))
     # A process that was killed has left half a line.
     (tmp_path / "metrics.jsonl").write_text('{"env_steps": 20')
@@ -356,7 +356,7 @@ def test_figures_draws_the_curves_again(run_folder, capsys):
         ),
     ],
 )
-def test_bad_options_of_a_try_are_refused(
+def test_bad_options_of_a_try_are_rejected(
     command, arguments, message, run_folder, tmp_path, capsys, monkeypatch
 ):
     monkeypatch.chdir(tmp_path)
@@ -368,7 +368,7 @@ def test_bad_options_of_a_try_are_refused(
 
 
 @pytest.mark.parametrize("command", ["eval", "play", "figures"])
-def test_what_is_not_a_run_is_refused(command, tmp_path, capsys):
+def test_what_is_not_a_run_is_rejected(command, tmp_path, capsys):
     assert main([command, str(tmp_path / "nothing")]) == 2
     error = capsys.readouterr().err
     assert "is not a run folder" in error
@@ -377,7 +377,7 @@ def test_what_is_not_a_run_is_refused(command, tmp_path, capsys):
 
 @pytest.mark.parametrize("command", ["eval", "play"])
 @pytest.mark.parametrize("damage", ["short", "foreign", "flipped", "edited", "other network"])
-def test_a_file_that_is_not_an_agent_is_refused(command, damage, run_folder, tmp_path, capsys):
+def test_a_file_that_is_not_an_agent_is_rejected(command, damage, run_folder, tmp_path, capsys):
     path = tmp_path / "some.safetensors"
     content = (run_folder / "best.safetensors").read_bytes()
     if damage == "short":
@@ -448,7 +448,7 @@ def test_a_file_of_options_is_a_starting_point(run_folder, tmp_path):
         (json.dumps(dump_config(train_config()) | {"num_envs": 2.5}), "num_envs must be a whole"),
     ],
 )
-def test_a_file_of_options_that_does_not_fit_is_refused(content, message, tmp_path, capsys):
+def test_a_file_of_options_that_does_not_fit_is_rejected(content, message, tmp_path, capsys):
     path = tmp_path / "config.json"
     path.write_text(content)
     assert main(["train", "--config", str(path), "--out", str(tmp_path / "run")]) == 2

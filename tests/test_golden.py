@@ -11,6 +11,7 @@ import pathlib
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 import mjx_arm
 
@@ -39,6 +40,7 @@ def play() -> dict[str, list]:
     }
 
 
+@pytest.mark.usefixtures("optimised")
 def test_a_few_steps_are_what_they_were():
     golden, now = json.loads(GOLDEN.read_text()), play()
     np.testing.assert_allclose(now["rewards"], golden["rewards"], atol=1e-4)

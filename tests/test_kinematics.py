@@ -85,7 +85,7 @@ def test_nested_vmap_gives_the_same_as_flat():
         np.testing.assert_allclose(one.reshape(other.shape), other, atol=1e-6)
 
 
-def test_a_ball_joint_is_refused_by_name():
+def test_a_ball_joint_is_rejected_by_name():
     model = mujoco.MjModel.from_xml_string("""
         <mujoco><worldbody>
           <body><joint name="wrist" type="ball"/><geom size="0.1"/></body>
@@ -95,7 +95,7 @@ def test_a_ball_joint_is_refused_by_name():
         make_kinematics(model)
 
 
-def test_mocap_bodies_are_refused():
+def test_mocap_bodies_are_rejected():
     model = mujoco.MjModel.from_xml_string("""
         <mujoco><worldbody><body mocap="true"><geom size="0.1"/></body></worldbody></mujoco>
     """)
@@ -193,7 +193,7 @@ def test_compiled_code_grows_linearly_with_a_chain_of_tilted_frames():
     assert 0 < six - four < 1.1 * (four - two)
 
 
-def test_fields_that_poses_cannot_vary_by_are_refused():
+def test_fields_that_poses_cannot_vary_by_are_rejected():
     for field in ("jnt_axis", "jnt_pos", "qpos0", "site_pos"):
         with pytest.raises(ValueError, match=f"'{field}' cannot vary by episode"):
             make_kinematics(odd(), {field: (0,)})
@@ -210,7 +210,7 @@ def test_fields_that_poses_cannot_vary_by_are_refused():
         ("eye", "camera 'eye' has the mode 'track'; supported is mode='fixed'"),
     ],
 )
-def test_other_cameras_are_refused_by_name(camera, message):
+def test_other_cameras_are_rejected_by_name(camera, message):
     model = mujoco.MjModel.from_xml_string("""
         <mujoco><worldbody>
           <body><freejoint/><geom size="0.1"/><camera name="eye" mode="track"/></body>

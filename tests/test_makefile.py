@@ -1,4 +1,4 @@
-"""What the Makefile refuses, and when it builds the environment again."""
+"""What the Makefile rejects, and when it builds the environment again."""
 
 import os
 import re
@@ -30,14 +30,14 @@ def venv(tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize("gpu", ["rocm", "cuda", "cuda12 cuda13", "cpu"])
-def test_unknown_gpu_is_refused(gpu: str, venv: Path) -> None:
+def test_unknown_gpu_is_rejected(gpu: str, venv: Path) -> None:
     result = make("setup", f"GPU={gpu}", f"VENV={venv}")
     assert result.returncode == 2
     assert f"GPU is cuda12 or cuda13, or left out for the CPU, and not '{gpu}'" in result.stderr
 
 
 @pytest.mark.parametrize("version", ["(3, 10)", "(3, 14)", None])
-def test_other_python_is_refused(version: str | None, venv: Path, tmp_path: Path) -> None:
+def test_other_python_is_rejected(version: str | None, venv: Path, tmp_path: Path) -> None:
     python = tmp_path / "python-other"
     if version is not None:
         patch = f"import sys; sys.version_info = {version}; exec(sys.argv.pop(1))"

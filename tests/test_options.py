@@ -140,6 +140,17 @@ def test_options_are_frozen_hashable_and_taken_by_name_only():
         Every(3)
 
 
+def test_an_option_that_cannot_be_hashed_is_rejected():
+    @options
+    class Listed:
+        """Options with a list."""
+
+        names: list[str] = dataclasses.field(default_factory=list)
+
+    with pytest.raises(ValueError, match=r"names must be of a type that can be hashed.* got list"):
+        Listed()
+
+
 def test_an_unknown_name_offers_the_nearest_known_one():
     with pytest.raises(ValueError, match=r"unknown option 'cuont': did you mean 'count'\?"):
         Every(cuont=1)
@@ -202,7 +213,7 @@ def test_presets_are_never_mutated():
     assert {name: hash(config) for name, config in PRESETS.items()} == before
 
 
-def test_a_configuration_of_version_0_1_is_refused_in_one_sentence():
+def test_a_configuration_of_version_0_1_is_rejected_in_one_sentence():
     """Its `env` was a name, and its options had no groups and no format."""
     old = {"env": "B", "physics": "native", "num_envs": 64, "cube_moves": "on_success"}
     with pytest.raises(ValueError, match=r"^some\.json was written by mjx_arm 0\.1, ") as raised:
@@ -210,7 +221,7 @@ def test_a_configuration_of_version_0_1_is_refused_in_one_sentence():
     assert "\n" not in str(raised.value)
 
 
-def test_another_format_is_refused():
+def test_another_format_is_rejected():
     content = dump_config(train_config()) | {"format": 99}
     with pytest.raises(ValueError, match="has the format 99; this version reads 2"):
         parse_config(json.dumps(content), "some.json")
@@ -238,7 +249,7 @@ def edit(change) -> str:
         (lambda c: c.update(seed=True), "seed must be a whole number of at least 0, got True"),
     ],
 )
-def test_a_damaged_configuration_is_refused_by_name(change, message):
+def test_a_damaged_configuration_is_rejected_by_name(change, message):
     with pytest.raises(ValueError, match=r"some\.json|task") as raised:
         parse_config(edit(change), "some.json")
     assert message in str(raised.value)

@@ -107,10 +107,10 @@ def test_two_files_with_one_name_are_rejected(folder):
 def test_a_file_that_is_no_scene_is_one_sentence(text, message, tmp_path):
     path = tmp_path / "scene.xml"
     path.write_bytes(text)
-    with pytest.raises(ValueError, match=message) as refused:
+    with pytest.raises(ValueError, match=message) as rejected:
         load_scene(path)
-    assert "\n" not in str(refused.value)
-    assert str(path) in str(refused.value)
+    assert "\n" not in str(rejected.value)
+    assert str(path) in str(rejected.value)
 
 
 def test_a_folder_is_not_a_scene(tmp_path):

@@ -64,7 +64,7 @@ def test_the_headlight_is_one_row(model):
         ({"headlight_diffuse": (1,)}, "has the row 1"),
     ],
 )
-def test_what_does_not_exist_is_refused_by_name(model, varies, message):
+def test_what_does_not_exist_is_rejected_by_name(model, varies, message):
     with pytest.raises(ValueError, match=message):
         check_varies(model, varies)
 

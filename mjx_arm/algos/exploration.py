@@ -32,7 +32,7 @@ def spread_epsilon(config: ExplorationConfig, epsilon: jax.Array, num_envs: int)
 
 
 def check_epsilon(epsilon: float) -> None:
-    """Refuses what is not a share of random actions.
+    """Rejects what is not a share of random actions.
 
     Raises:
       ValueError: it is not from 0 to 1.

@@ -16,7 +16,7 @@ from mjx_arm.devices import check_device
 from mjx_arm.envs.randomisation import RandomisationConfig
 from mjx_arm.export import check_path, image_shape, write_policy
 from mjx_arm.options import option_names
-from mjx_arm.report.video import check_video_path, draw_episode, record_episode, write_video
+from mjx_arm.report.video import check_video_path, render_episode, record_episode, write_video
 from mjx_arm.training.agent import STORED, Agent, differences, load_agent
 from mjx_arm.training.evaluate import evaluate
 from mjx_arm.training.loop import EVALUATION, role_key
@@ -24,7 +24,7 @@ from mjx_arm.training.mesh import make_mesh
 
 
 def check_seed(seed: int) -> None:
-    """Refuses what is no seed.
+    """Rejects what is no seed.
 
     Raises:
       ValueError: it is not from 0 to 2**31 - 1.
@@ -139,7 +139,7 @@ class Play(AgentOptions):
         episode = record_episode(
             agent.env, agent.apply, agent.params, epsilon=self.epsilon, key=self.key()
         )
-        write_video(self.out, draw_episode(agent.env, episode))
+        write_video(self.out, render_episode(agent.env, episode))
         print(f"{self.out}: {len(episode)} frames, success: {episode.success}")
 
 

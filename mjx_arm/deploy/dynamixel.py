@@ -92,7 +92,7 @@ class DynamixelConfig:
     camera: str = "/dev/video0"
 
     def check(self) -> None:
-        """Refuses lists that are empty or of different lengths, and ids that occur twice."""
+        """Rejects lists that are empty or of different lengths, and ids that occur twice."""
         lengths = {len(x) for x in (self.joints, self.signs, self.zeros)}
         if len(lengths) != 1 or not self.joints:
             raise ValueError(
@@ -332,7 +332,7 @@ class DynamixelRobot:
             self._check_hardware(servo)
         if error & ~_ALERT:
             words = self._packets.getRxPacketError(error & ~_ALERT).split("] ")[-1].rstrip("!.")
-            raise RobotError(f"{self._name(servo)} refuses: {words}")
+            raise RobotError(f"{self._name(servo)} rejects: {words}")
         return answer[0]
 
     def _read(self, servo: int, field: tuple[int, int], *, alert: bool = True) -> int:

@@ -66,7 +66,7 @@ class Guard:
                 )
         return angles
 
-    def refuses(self, angles: np.ndarray, joint: int, degrees: float) -> str | None:
+    def rejects(self, angles: np.ndarray, joint: int, degrees: float) -> str | None:
         """Why a step is rejected, as a sentence; None if it is allowed.
 
         Steps that lead back from beyond a bound are allowed.

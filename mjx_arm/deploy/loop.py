@@ -76,7 +76,7 @@ class Outcome:
       reason: one sentence.
       ticks: number of complete ticks; one in which the robot fails is not complete.
       misses: ticks that were not over before the next one was due.
-      refused: actions that the guard did not let through.
+      rejected: actions that the guard did not let through.
       inference_ms: `[ticks] float64`, time of the policy, ms.
       image_age_ms: `[ticks] float64`, age of the image when the action was sent, ms.
     """
@@ -85,7 +85,7 @@ class Outcome:
     reason: str
     ticks: int
     misses: int
-    refused: int
+    rejected: int
     inference_ms: np.ndarray
     image_age_ms: np.ndarray
 
@@ -93,7 +93,7 @@ class Outcome:
 @dataclasses.dataclass
 class _Tally:
     misses: int = 0
-    refused: int = 0
+    rejected: int = 0
     inference_ms: list[float] = dataclasses.field(default_factory=list)
     image_age_ms: list[float] = dataclasses.field(default_factory=list)
 
@@ -171,7 +171,7 @@ class _Loop:
                     self.log.write(self._last_line(ending, reason))
         tally = self.tally
         ages, times = np.asarray(tally.image_age_ms), np.asarray(tally.inference_ms)
-        return Outcome(ending, reason, len(times), tally.misses, tally.refused, times, ages)
+        return Outcome(ending, reason, len(times), tally.misses, tally.rejected, times, ages)
 
     def _ticks(self) -> tuple[Ending, str]:
         period, tick = 1 / self.config.rate, 0
@@ -197,17 +197,17 @@ class _Loop:
         thinks = clock.now()
         q, best = self.policy(frame.image)
         inference_ms = 1000 * (clock.now() - thinks)
-        action, refused = self._choose(best), None
+        action, rejected = self._choose(best), None
         if action < 2 * len(angles):
-            refused = self.guard.refuses(angles, action // 2, self._step(action))
-        sends = refused is None and not self.config.dry_run and not self.stop.is_set()
+            rejected = self.guard.rejects(angles, action // 2, self._step(action))
+        sends = rejected is None and not self.config.dry_run and not self.stop.is_set()
         try:
             if sends:
                 self._send(action)
         finally:
             # Also where the robot fails in the middle: the log then has the command that it got.
             sent = clock.now()
-            tally.refused += refused is not None
+            tally.rejected += rejected is not None
             tally.inference_ms.append(inference_ms)
             tally.image_age_ms.append(1000 * (sent - frame.time))
             late = sent > deadline
@@ -224,7 +224,7 @@ class _Loop:
                     "best": best,
                     "action": action,
                     "sent": sends,
-                    "refused": refused,
+                    "rejected": rejected,
                     "late": late,
                     "image": frame.image,
                 }
@@ -283,7 +283,7 @@ class _Loop:
             "ending": ending,
             "ticks": len(tally.inference_ms),
             "misses": tally.misses,
-            "refused": tally.refused,
+            "rejected": tally.rejected,
         }
 
 
@@ -294,7 +294,7 @@ def describe_outcome(outcome: Outcome) -> dict[str, Any]:
         "reason": outcome.reason,
         "ticks": outcome.ticks,
         "misses": outcome.misses,
-        "refused": outcome.refused,
+        "rejected": outcome.rejected,
     }
     for name in ("inference_ms", "image_age_ms"):
         times = getattr(outcome, name)

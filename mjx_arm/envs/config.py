@@ -78,7 +78,7 @@ class EnvConfig:
     randomise: RandomisationConfig = dataclasses.field(default_factory=RandomisationConfig)
 
     def check(self) -> None:
-        """Refuses options that do not fit together."""
+        """Rejects options that do not fit together."""
         entry = find_task(self.task)
         if type(self.task_options) is not entry.config:
             raise ValueError(

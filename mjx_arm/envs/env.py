@@ -434,7 +434,7 @@ def _remake(config: EnvConfig, reward: Reward | None, name: str, source: SceneSo
 
 
 def _check_reward(env: Env) -> None:
-    """Refuses a reward that does not return a dict of named `[] float32` terms.
+    """Rejects a reward that does not return a dict of named `[] float32` terms.
 
     Those of the shipped tasks have tests instead: to trace a start takes a moment.
     """

@@ -22,7 +22,7 @@ from mjx_arm.varies import Params
 # that is below 1e-9.
 MAX_SAMPLES = 32
 
-# Folded into the key of a start for what its task makes easier.
+# What is folded into the key of a start to make the key of `ease`.
 _EASE = 1
 
 # Key, joints, number of samples, whether the last one is free.
@@ -35,8 +35,8 @@ class StartSampler:
 
     Attributes:
       arm: the arm.
-      task: puts its objects.
-      collision: whether the arm is free of itself, its base, the ground and the task's objects.
+      task: places its objects.
+      collision: whether the arm keeps clear of itself, its base, the ground and the objects.
       kinematics: poses of a `qpos`.
       config: how joints and objects vary.
       add_params: adds to the params of the task what else varies in the episode.

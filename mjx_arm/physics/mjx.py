@@ -58,7 +58,7 @@ _INTEGRATORS = tuple(
 
 
 def _refuse_to_hang(mj_model: mujoco.MjModel) -> None:
-    """Refuses a program that XLA's CPU backend may never finish.
+    """Rejects a program that XLA's CPU backend may never finish.
 
     XLA's batched Cholesky waits on a thread of the pool for pieces that are queued to the same pool
     (`ParallelBatchMap` in jaxlib 0.10). If as many factorisations run at once as there are threads,
@@ -83,8 +83,8 @@ def _refuse_to_hang(mj_model: mujoco.MjModel) -> None:
         )
 
 
-def _refuse_what_mjx_ignores(mj_model: mujoco.MjModel) -> None:
-    """Refuses models that MJX accepts, but simulates without one of their parts.
+def _reject_what_mjx_ignores(mj_model: mujoco.MjModel) -> None:
+    """Rejects models that MJX accepts, but simulates without one of their parts.
 
     Raises:
       ValueError: names the part.
@@ -157,7 +157,7 @@ def make_mjx(
         fields vary with the implementation `"warp"`.
     """
     if impl == "jax":
-        _refuse_what_mjx_ignores(mj_model)
+        _reject_what_mjx_ignores(mj_model)
         _refuse_to_hang(mj_model)
     elif varies:
         raise ValueError(

@@ -82,7 +82,7 @@ def validate_geoms(mj_model: mujoco.MjModel, varies: Varies | None = None) -> No
 
 
 def _validate_texture(mj_model: mujoco.MjModel, geom: int) -> None:
-    """Refuses a geom whose material has a texture that the renderer cannot show."""
+    """Rejects a geom whose material has a texture that the renderer cannot show."""
     material = int(mj_model.geom_matid[geom])
     roles = np.flatnonzero(mj_model.mat_texid[material] >= 0) if material >= 0 else np.zeros(0)
     if not roles.size:
@@ -123,7 +123,7 @@ def why_not_rendered(mj_model: mujoco.MjModel, texture: int) -> str:
 
 
 def _validate_others(mj_model: mujoco.MjModel) -> None:
-    """Refuses what MuJoCo shows besides geoms and sites."""
+    """Rejects what MuJoCo shows besides geoms and sites."""
     for kind, number in _UNSUPPORTED.items():
         alpha = getattr(mj_model, f"{kind}_rgba").reshape(-1, 4)[:, 3]
         visible = (getattr(mj_model, f"{kind}_group") < VISIBLE_GROUPS) & (alpha > 0)

@@ -109,7 +109,7 @@ def _read_rows(path: pathlib.Path) -> list[dict[str, float]]:
 
 
 def _check_names(path: pathlib.Path, rows: list[dict[str, float]]) -> None:
-    """Refuses a row that lacks a metric which an earlier row has.
+    """Rejects a row that lacks a metric which an earlier row has.
 
     The first row must also have what all later ones have. Later rows may have more: another version
     has continued the run.
@@ -130,7 +130,7 @@ def _whole_lines(path: pathlib.Path) -> list[bytes]:
 
 def _parse_row(path: pathlib.Path, number: int, line: bytes) -> dict[str, float]:
     with contextlib.suppress(ValueError, OverflowError, RecursionError):
-        row = json.loads(line, parse_constant=_refuse)
+        row = json.loads(line, parse_constant=_reject)
         if isinstance(row, dict) and _has_numbers(row):
             return {name: math.nan if x is None else x for name, x in row.items()}
     raise _damaged(path, number)
@@ -143,7 +143,7 @@ def _has_numbers(row: dict[str, Any]) -> bool:
     return always and all(type(x) in _NUMBERS and not math.isinf(x) for x in known)
 
 
-def _refuse(constant: str) -> NoReturn:
+def _reject(constant: str) -> NoReturn:
     raise ValueError(constant)
 
 

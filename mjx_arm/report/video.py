@@ -92,7 +92,7 @@ def record_episode(
     return Episode(qpos[:frames], max_q[:frames], episode_params, bool(success.any()))
 
 
-def draw_episode(env: Env, episode: Episode) -> Iterator[np.ndarray]:
+def render_episode(env: Env, episode: Episode) -> Iterator[np.ndarray]:
     """Renders an episode: the scene with shadows, and beside it what the agent sees.
 
     Labels name both sides, the step, the largest Q-value and, at the end, the result.
@@ -147,7 +147,7 @@ def _first_camera(image: jax.Array, env: Env) -> jax.Array:
 
 
 def check_video_path(path: pathlib.Path) -> None:
-    """Refuses a path that `write_video` could not write to.
+    """Rejects a path that `write_video` could not write to.
 
     Raises:
       ValueError: its ending is neither `.mp4` nor `.gif`, or its folder is not there.

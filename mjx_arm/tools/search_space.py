@@ -77,7 +77,7 @@ def _parse(text: str, config: TrainConfig) -> Dimension:
 
 
 def check_space(space: Sequence[Dimension], config: TrainConfig) -> None:
-    """Refuses a space of whose options one end alone does not fit the others.
+    """Rejects a space of whose options one end alone does not fit the others.
 
     Raises:
       ValueError: it does not.

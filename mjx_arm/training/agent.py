@@ -305,7 +305,7 @@ def _restore(
 def check_tensors(
     path: pathlib.Path, tensors: Mapping[str, np.ndarray], dtypes: Mapping[str, Any]
 ) -> None:
-    """Refuses the tensors of an agent that have another dtype or are not finite, by name.
+    """Rejects the tensors of an agent that have another dtype or are not finite, by name.
 
     Raises:
       ValueError: one has, or is not.
@@ -354,12 +354,17 @@ def find_agent(path: pathlib.Path) -> pathlib.Path:
     if not path.exists() and str(path) in shipped_agents():
         return shipped
     if path.is_file():
+        if path.suffix == ".agent":
+            raise ValueError(
+                f"{path} is an agent of mjx_arm 0.1, which this version cannot read: train again, "
+                "or install mjx_arm 0.1"
+            )
         return path
     for name in (BEST, LAST):
         if (path / name).is_file():
             return path / name
     if (path / CONFIG).is_file():
-        load_run(path)  # refuses runs of other versions, whose agents have other names
+        load_run(path)  # rejects runs of other versions, whose agents have other names
         seeds = ", ".join(sorted(str(seed) for seed in path.glob("seed-*")))
         hint = f"give one of {seeds}" if seeds else "the run has not saved one yet"
         raise ValueError(f"{path} holds no agent: {hint}")

@@ -185,7 +185,7 @@ def load_tree(path: pathlib.Path, like: Any) -> Any:
 def check_tree(
     path: pathlib.Path, like: Any, *, origin: Origin | None = None, step: int | None = None
 ) -> None:
-    """Refuses what `load_tree` could not read, and what belongs to something else.
+    """Rejects what `load_tree` could not read, and what belongs to something else.
 
     Args:
       path: of the checkpoint.
@@ -286,7 +286,7 @@ def _describe(tree: Any) -> list[str]:
 class RunCheckpoints:
     """The checkpoints of a run folder, by the number of vector steps that they were taken after.
 
-    With an `origin` those that belong to something else are refused.
+    With an `origin` those that belong to something else are rejected.
     """
 
     def __init__(self, folder: pathlib.Path, origin: Origin | None = None):

@@ -271,7 +271,7 @@ def make_body(
 
 
 def check_takes_shard(algorithm: Callable[..., Algorithm], devices: int) -> None:
-    """Refuses an algorithm of one's own that would not average its gradients.
+    """Rejects an algorithm of one's own that would not average its gradients.
 
     Raises:
       ValueError: the function that makes it has no argument `shard`.
@@ -284,7 +284,7 @@ def check_takes_shard(algorithm: Callable[..., Algorithm], devices: int) -> None
 
 
 def _check_q_values(q: jax.Array, num_envs: int, num_actions: int) -> None:
-    """Refuses a network that has another number of actions: the wrong ones would be taken."""
+    """Rejects a network that has another number of actions: the wrong ones would be taken."""
     if q.shape != (num_envs, num_actions):
         raise ValueError(
             f"the network must return Q-values of shape {[num_envs, num_actions]}, one for each "

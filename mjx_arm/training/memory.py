@@ -55,7 +55,7 @@ def working_memory(compiled: jax.stages.Compiled, physics: Physics, simulations:
 
 
 def check_memory(plan: dict[str, int], devices: int = 1) -> None:
-    """Refuses a plan that cannot fit.
+    """Rejects a plan that cannot fit.
 
     Args:
       plan: bytes on one device.

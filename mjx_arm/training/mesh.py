@@ -66,7 +66,7 @@ def shards_seeds(config: TrainConfig, devices: int) -> bool:
 
 
 def check_division(config: TrainConfig, devices: int) -> None:
-    """Refuses a number of devices that does not divide the work.
+    """Rejects a number of devices that does not divide the work.
 
     Raises:
       ValueError: it divides neither the seeds nor the environments and each batch.

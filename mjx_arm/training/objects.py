@@ -91,7 +91,7 @@ def only_here(recorded: Record) -> list[str]:
 
 
 def check_record(recorded: Record, config: TrainConfig, objects: Objects, where: str) -> None:
-    """Refuses objects that are not those of the record.
+    """Rejects objects that are not those of the record.
 
     Raises:
       ValueError: one is missing, or another one, or its source or its values have changed.
@@ -127,7 +127,7 @@ def check_record(recorded: Record, config: TrainConfig, objects: Objects, where:
 
 
 def check_given_again(recorded: Record, given: Collection[str], where: str) -> None:
-    """Refuses a configuration to start from that lacks an object which its run was passed.
+    """Rejects a configuration to start from that lacks an object which its run was passed.
 
     Args:
       recorded: the objects of the run.

@@ -41,7 +41,7 @@ from mjx_arm.report.progress import (
     say_working_memory,
 )
 from mjx_arm.report.run_page import write_report
-from mjx_arm.report.video import draw_episode, record_episode, write_video
+from mjx_arm.report.video import render_episode, record_episode, write_video
 from mjx_arm.scene import Scene, compile_scene, read_source, scene_exists
 from mjx_arm.training.agent import (
     BEST,
@@ -372,7 +372,7 @@ def _scene_of(folder: pathlib.Path, saved: SavedRun, objects: Objects) -> Scene:
 
 
 def _check_same_env(saved: TrainConfig, given: TrainConfig, folder: pathlib.Path) -> None:
-    """Refuses an environment that is passed again with other options."""
+    """Rejects an environment that is passed again with other options."""
     for name, (was, now) in differences(saved.env, given.env).items():
         raise ValueError(f"{folder} was made with an env= of {name} = {was}, got {now}")
 
@@ -400,7 +400,7 @@ def _check_options(eval_episodes: int, stop_at: float | None, minutes: float | N
 
 
 def _check_whole_run(folder: pathlib.Path) -> None:
-    """Refuses the folder of one seed of several, whose checkpoints are those of all."""
+    """Rejects the folder of one seed of several, whose checkpoints are those of all."""
     parent = folder.resolve().parent
     if not (parent / "config.json").is_file():
         return
@@ -463,7 +463,7 @@ def _local_devices(trainer: Trainer) -> int:
 
 
 def _compile(trainer: Trainer, console: Console) -> RunChunk:
-    """The compiled chunk; refused where what it needs to work in does not fit beside the state."""
+    """The compiled chunk; rejected where what it needs to work in does not fit beside the state."""
     shapes = trainer.shapes()
     with phase(console, "compiling", "about a minute"):
         compiled = trainer.run_chunk.lower(shapes).compile()
@@ -832,7 +832,7 @@ def _evaluate_seed(
         episode = record_episode(
             agent.env, agent.apply, agent.params, epsilon=_EVALUATION_EPSILON, key=key
         )
-        write_video(path, draw_episode(agent.env, episode))
+        write_video(path, render_episode(agent.env, episode))
     console.print(
         f"video: {path} ({len(episode)} frames, success: {episode.success})", soft_wrap=True
     )

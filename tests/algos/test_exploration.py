@@ -68,6 +68,6 @@ def test_the_mean_share_of_the_defaults_is_as_documented(epsilon, mean):
 
 
 @pytest.mark.parametrize("epsilon", [-0.1, 1.1, float("nan")])
-def test_what_is_no_share_is_refused(epsilon):
+def test_what_is_no_share_is_rejected(epsilon):
     with pytest.raises(ValueError, match="epsilon must be a finite number from 0 to 1, got"):
         check_epsilon(epsilon)

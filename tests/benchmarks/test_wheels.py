@@ -33,7 +33,7 @@ def test_what_the_image_has_is_not_fetched():
     assert wheels.to_fetch(resolved, "3.12") == ["etils==1.0", "mujoco==1.0", "trimesh==1.0"]
 
 
-def test_what_does_not_run_on_the_other_python_is_refused():
+def test_what_does_not_run_on_the_other_python_is_rejected():
     one = {"metadata": {"name": "etils", "version": "1.0", "requires_python": ">=3.13"}}
     assert wheels.to_fetch([one], "3.13") == ["etils==1.0"]
     with pytest.raises(
@@ -48,7 +48,7 @@ def test_another_machine_is_named_to_pip():
     assert "manylinux_2_28_x86_64" in options
 
 
-def test_a_folder_that_is_not_empty_is_refused(tmp_path):
+def test_a_folder_that_is_not_empty_is_rejected(tmp_path):
     (tmp_path / "file").touch()
     with pytest.raises(ValueError, match="is not empty: give a new or empty folder"):
         wheels.fetch(tmp_path, "3.12", "0.10.2", warp=False)

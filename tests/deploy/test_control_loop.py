@@ -125,7 +125,7 @@ def test_a_late_tick_is_a_miss_and_nothing_is_caught_up(run) -> None:
 
 def test_random_actions_have_their_share(run) -> None:
     made = run(epsilon=0.5, seconds=20.0, actions=[OPEN])
-    others = sum(told != ("open",) for told in made.robot.told[:-1]) + made.outcome.refused
+    others = sum(told != ("open",) for told in made.robot.told[:-1]) + made.outcome.rejected
     assert 0.3 < others / made.outcome.ticks < 0.55  # 5 of 6 random actions are others
 
 
@@ -146,21 +146,21 @@ def test_the_task_may_be_done(run) -> None:
 def test_the_joints_stay_in_their_range(run) -> None:
     made = run(actions=[3], seconds=2.0)
     assert made.robot.angles.tolist() == [0.0, 20.0]
-    assert made.outcome.refused == 50 - 10
+    assert made.outcome.rejected == 50 - 10
     ticks = read_log(made.path).ticks
     assert [tick["sent"] for tick in ticks] == [True] * 10 + [False] * 40
-    assert ticks[-1]["refused"] == "joint 1 would leave its range"
+    assert ticks[-1]["rejected"] == "joint 1 would leave its range"
 
 
 def test_the_gripper_stays_in_its_box(run, guard) -> None:
     made = run(actions=[1], seconds=4.0)
     assert guard.gripper(made.robot.angles)[2] >= 0.05
     assert guard.gripper(made.robot.angles + np.asarray([1.0, 0.0]))[2] < 0.05
-    assert read_log(made.path).ticks[-1]["refused"] == "the gripper would leave the workspace"
+    assert read_log(made.path).ticks[-1]["rejected"] == "the gripper would leave the workspace"
     # The way back is free.
-    assert guard.refuses(np.asarray([60.0, 10.0]), 0, -1.0) is None
-    assert guard.refuses(np.asarray([60.0, 10.0]), 0, 1.0) is not None
-    assert guard.refuses(np.asarray([0.0, 25.0]), 1, -1.0) is None
+    assert guard.rejects(np.asarray([60.0, 10.0]), 0, -1.0) is None
+    assert guard.rejects(np.asarray([60.0, 10.0]), 0, 1.0) is not None
+    assert guard.rejects(np.asarray([0.0, 25.0]), 1, -1.0) is None
 
 
 @pytest.mark.parametrize("box", [(0, 0, 0, 1, 1), (0, 0, 0, 1, 1, 0), (0, 0, 0, 1, 1, np.nan)])
@@ -323,7 +323,7 @@ def test_a_log_can_be_replayed(run) -> None:
     assert (other.same, other.largest) == (0, 1.0)
 
 
-def test_a_damaged_log_is_refused_by_its_line(run, tmp_path) -> None:
+def test_a_damaged_log_is_rejected_by_its_line(run, tmp_path) -> None:
     path = run().path
     lines = path.read_text().splitlines()
     cut = tmp_path / "cut.jsonl"

@@ -170,7 +170,7 @@ def test_a_joint_that_does_not_follow_is_named(bus, robot) -> None:
     robot.joint_angles()
 
 
-def test_a_wrong_operating_mode_is_refused(bus) -> None:
+def test_a_wrong_operating_mode_is_rejected(bus) -> None:
     bus.servos[9].table[11] = 16
     with pytest.raises(
         RobotError, match=r"servo 9 \(gripper\) is in operating mode 16, set 3 or 5"

@@ -56,6 +56,6 @@ def test_an_error_and_a_request_are_named(body: str, problem: str, tmp_path: pat
     assert found == [f"index.html, {width} pixels wide: {problem}" for width in (1280, 390)]
 
 
-def test_an_empty_folder_is_refused(tmp_path: pathlib.Path):
+def test_an_empty_folder_is_rejected(tmp_path: pathlib.Path):
     with pytest.raises(ValueError, match="must be a folder of HTML pages"):
         check_pages(tmp_path)

@@ -44,6 +44,6 @@ def test_a_style_that_loads_a_font_from_elsewhere_is_named(tmp_path: pathlib.Pat
     assert check_site(tmp_path) == ["a.css loads https://fonts.org/f.woff2 from another host"]
 
 
-def test_an_empty_folder_is_refused(tmp_path: pathlib.Path):
+def test_an_empty_folder_is_rejected(tmp_path: pathlib.Path):
     with pytest.raises(ValueError, match="must be a folder of HTML pages"):
         check_site(tmp_path)

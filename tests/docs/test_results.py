@@ -114,7 +114,7 @@ def test_what_is_missing_is_not_measured(tmp_path: pathlib.Path):
     assert "| 64 | not measured | 1,234 |" in text
 
 
-def test_an_unknown_table_is_refused():
+def test_an_unknown_table_is_rejected():
     with pytest.raises(ValueError, match="results must name one of throughput"):
         render("none")
 

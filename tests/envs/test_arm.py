@@ -140,7 +140,7 @@ def test_an_arm_of_a_slide_and_a_hinge_has_six_actions(tmp_path):
         ([('<key name="home"/>', '<key name="home" ctrl="0.1 0 0"/>')], "must have the joint"),
     ],
 )  # fmt: skip
-def test_an_arm_that_is_not_as_assumed_is_refused_by_name(tmp_path, changes, message):
+def test_an_arm_that_is_not_as_assumed_is_rejected_by_name(tmp_path, changes, message):
     with pytest.raises(ValueError, match=message) as raised:
         crane(tmp_path, *changes)
     assert "\n" not in str(raised.value)

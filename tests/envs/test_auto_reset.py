@@ -116,6 +116,6 @@ def test_the_cube_moves_when_it_should(short, placement, after_failure, after_su
         assert (np.asarray(state.env.placement) != place).any() == moves
 
 
-def test_unknown_mode_is_refused(short):
+def test_unknown_mode_is_rejected(short):
     with pytest.raises(ValueError, match="unknown auto-reset mode"):
         mjx_arm.AutoReset(short, "sometimes")

@@ -189,7 +189,7 @@ def test_commands_of_a_batch_are_blocked_one_by_one():
         assert jax.jit(collision.is_blocked)(*row) == wanted[index]
 
 
-def test_a_home_that_collides_is_refused():
+def test_a_home_that_collides_is_rejected():
     model = models()["arm_cube"]
     home = model.key_qpos[0].copy()
     home[1] += 0.8
@@ -197,7 +197,7 @@ def test_a_home_that_collides_is_refused():
         make_self_collision(model, home=home)
 
 
-def test_an_ellipsoid_is_refused():
+def test_an_ellipsoid_is_rejected():
     model = mujoco.MjModel.from_xml_string(
         '<mujoco><worldbody><body><joint/><geom name="egg" type="ellipsoid" size="1 2 3"/></body>'
         "</worldbody></mujoco>"

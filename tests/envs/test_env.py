@@ -158,7 +158,7 @@ def test_a_diverged_simulation_ends_its_own_episode_only():
 
 
 @pytest.mark.parametrize("action", [-1, 14, 2.0, "up", [0, 1]])
-def test_an_invalid_action_is_refused(env, action):
+def test_an_invalid_action_is_rejected(env, action):
     _, state = reset_once(env)
     with pytest.raises(ValueError, match="0 to 13"):
         env.step(jax.random.key(0), state, action)
@@ -183,7 +183,7 @@ def test_an_invalid_action_is_refused(env, action):
         ("A", {"scene": "kitchen"}, "unknown scene 'kitchen'"),
     ],
 )
-def test_bad_options_are_refused_in_one_sentence(name, options, message):
+def test_bad_options_are_rejected_in_one_sentence(name, options, message):
     with pytest.raises(ValueError, match=message) as raised:
         mjx_arm.make(name, **options)
     assert "\n" not in str(raised.value)
@@ -210,7 +210,7 @@ def test_bad_options_are_refused_in_one_sentence(name, options, message):
         (lambda before, after, action: after.measured["hight"], "fails when .* KeyError: 'hight'"),
     ],
 )
-def test_a_reward_that_returns_no_terms_is_refused_by_name(reward, message):
+def test_a_reward_that_returns_no_terms_is_rejected_by_name(reward, message):
     with pytest.raises(ValueError, match=message) as raised:
         mjx_arm.make("A", reward=reward, physics="native", observation="state")
     assert "\n" not in str(raised.value)
@@ -224,7 +224,7 @@ def test_a_reward_may_return_plain_numbers():
     assert (reward.shape, reward.dtype) == ((), jnp.float32)
 
 
-def test_a_scene_without_the_names_of_the_task_is_refused(tmp_path):
+def test_a_scene_without_the_names_of_the_task_is_rejected(tmp_path):
     path = tmp_path / "ball.xml"
     path.write_text('<mujoco><worldbody><geom type="sphere" size="1"/></worldbody></mujoco>')
     assert mjx_arm.load_scene(path).mj_model.ngeom == 1

@@ -405,7 +405,7 @@ class Sizeless:
 mjx_arm.register("sizeless", Sizeless, config=LiftConfig, scene="arm_cube_desk")
 
 
-def test_a_task_that_does_not_know_sizes_is_refused_where_they_vary():
+def test_a_task_that_does_not_know_sizes_is_rejected_where_they_vary():
     with pytest.raises(ValueError, match=r"task 'sizeless' has no method with_params.*cube_size"):
         make(task="sizeless", randomisation="standard")
     env = make(task="sizeless", randomisation="standard", cube_size=(1.0, 1.0))

@@ -346,7 +346,7 @@ def test_a_position_servo_with_or_without_a_filter_is_taken(servo, load):
         ({"home": '<key name="away"/>'}, "no keyframe named 'home'"),
     ],
 )
-def test_an_invalid_robot_is_refused_by_name(options, message, load):
+def test_an_invalid_robot_is_rejected_by_name(options, message, load):
     if "servos" in options:
         options = {**options, "home": '<key name="home"/>'}
     with pytest.raises(ValueError, match=message) as raised:

@@ -52,7 +52,7 @@ def test_the_cube_outlives_a_failed_episode_but_not_a_seed():
 @pytest.mark.parametrize(
     ("action", "message"), [(14, "got 14"), (-1, "got -1"), (2.5, "got 2.5"), ([1, 2], "got")]
 )
-def test_invalid_actions_are_refused(action, message):
+def test_invalid_actions_are_rejected(action, message):
     env = mjx_arm.interop.ArmCubeEnv(**OPTIONS)
     env.reset(seed=0)
     with pytest.raises(
@@ -65,7 +65,7 @@ def test_invalid_actions_are_refused(action, message):
 @pytest.mark.filterwarnings("ignore:.*fork.*")
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="there is no fork here")
 @pytest.mark.parametrize("kind", ["ArmCubeEnv", "ArmCubeVectorEnv"])
-def test_a_process_that_was_forked_from_one_with_jax_is_refused(kind):
+def test_a_process_that_was_forked_from_one_with_jax_is_rejected(kind):
     make = getattr(mjx_arm.interop, kind)
     options = {"num_envs": 2} if kind == "ArmCubeVectorEnv" else {}
     ours, theirs = os.pipe()
@@ -85,7 +85,7 @@ def test_a_process_that_was_forked_from_one_with_jax_is_refused(kind):
     assert "context='spawn'" in said
 
 
-def test_step_before_reset_is_refused():
+def test_step_before_reset_is_rejected():
     for env in (mjx_arm.interop.ArmCubeEnv(**OPTIONS), vector_env()):
         with pytest.raises(ValueError, match="call reset first"):
             env.step(np.zeros(3, int))
@@ -187,7 +187,7 @@ def test_a_task_that_is_registered_later_has_its_ids(later):
     assert (env.env.config.task, env.env.config.env) == ("point_there", "B")
 
 
-def test_a_task_with_the_ids_of_another_is_refused_and_not_registered(later):
+def test_a_task_with_the_ids_of_another_is_rejected_and_not_registered(later):
     later("point_there", Reach)
     for name in ("arm_cube", "point__there"):
         with pytest.raises(ValueError, match=r"the gymnasium id 'mjx_arm/.*A-v0' of another task"):
@@ -197,19 +197,19 @@ def test_a_task_with_the_ids_of_another_is_refused_and_not_registered(later):
 
 
 @pytest.mark.parametrize("name", ["", "own:task", "own task", "7"])
-def test_a_name_that_cannot_be_an_id_is_refused(name, later):
+def test_a_name_that_cannot_be_an_id_is_rejected(name, later):
     with pytest.raises(ValueError, match="the name of a task must be a letter, then letters"):
         later(name, Reach)
 
 
-def test_what_makes_no_task_is_refused(later):
+def test_what_makes_no_task_is_rejected(later):
     with pytest.raises(ValueError, match="name must be text, got None"):
         later(None, Reach)
     with pytest.raises(ValueError, match=r"'made_up' must be made by a function .*, got 'Reach'"):
         later("made_up", "Reach")
 
 
-def test_bad_vector_options_are_refused():
+def test_bad_vector_options_are_rejected():
     with pytest.raises(ValueError, match="num_envs must be at least 1, got 0"):
         mjx_arm.interop.ArmCubeVectorEnv(num_envs=0)
     with pytest.raises(ValueError, match="unknown auto-reset mode"):

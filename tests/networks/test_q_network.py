@@ -111,7 +111,7 @@ def test_features_are_scaled_before_they_are_used():
         ("mjx_arm.networks:PixelQNetwork", "with the one attribute num_actions"),
     ],
 )
-def test_a_network_that_cannot_be_made_is_refused(network, message):
+def test_a_network_that_cannot_be_made_is_rejected(network, message):
     config = train_config(network=network).network
     with pytest.raises(ValueError, match=message) as raised:
         make_network(config, num_actions=14, feature_scales=None)

@@ -118,7 +118,7 @@ def test_auto_is_native_on_cpu(scene):
     assert make_physics(scene.mj_model, substeps=2).backend == expected
 
 
-def test_unknown_backend_is_refused(scene):
+def test_unknown_backend_is_rejected(scene):
     with pytest.raises(ValueError, match="unknown physics 'bullet': give one of auto, mjx"):
         make_physics(scene.mj_model, "bullet", substeps=2)
 

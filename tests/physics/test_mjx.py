@@ -67,21 +67,21 @@ def on_two_threads(monkeypatch):
     monkeypatch.setenv("NPROC", "2")
 
 
-def test_a_program_that_may_hang_is_refused(scene, on_two_threads):
+def test_a_program_that_may_hang_is_rejected(scene, on_two_threads):
     model = copy.copy(scene.mj_model)
     model.opt.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     with pytest.raises(ValueError, match="start with NPROC=3 in the environment, or give"):
         make_mjx(model, 2)
 
 
-def test_as_many_devices_as_threads_are_refused(scene, on_two_threads, monkeypatch):
+def test_as_many_devices_as_threads_are_rejected(scene, on_two_threads, monkeypatch):
     monkeypatch.setattr(jax, "local_device_count", lambda: 2)
     with pytest.raises(ValueError, match="2 threads and 2 matrix factorisations at once"):
         make_physics(scene.mj_model, "mjx", substeps=2, mjx_iterations=(5, 8))
 
 
 @pytest.mark.parametrize(("integrator", "threads"), [("IMPLICITFAST", "3"), ("EULER", "2")])
-def test_enough_threads_are_not_refused(scene, on_two_threads, monkeypatch, integrator, threads):
+def test_enough_threads_are_not_rejected(scene, on_two_threads, monkeypatch, integrator, threads):
     monkeypatch.setenv("NPROC", threads)
     model = copy.copy(scene.mj_model)
     model.opt.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{integrator}")
@@ -135,7 +135,7 @@ def test_the_scene_says_how_often_mjx_iterates(scene, tmp_path):
 
 
 @pytest.mark.parametrize("iterations", [(5,), (5, 0), (5.5, 8), (True, 8)])
-def test_iterations_that_are_no_counts_are_refused(scene, iterations):
+def test_iterations_that_are_no_counts_are_rejected(scene, iterations):
     with pytest.raises(ValueError, match="mjx_iterations must be"):
         make_physics(scene.mj_model, "mjx", substeps=2, mjx_iterations=iterations)
 
@@ -182,12 +182,12 @@ def test_what_mjx_does_not_implement_is_named(parts, named):
     assert make_physics(model, "native", substeps=1).backend == "native"
 
 
-def test_the_model_without_these_parts_is_not_refused():
+def test_the_model_without_these_parts_is_not_rejected():
     assert make_physics(model_with(), "mjx", substeps=1).backend == "mjx"
 
 
 @pytest.mark.skipif(not WITHOUT_WARP, reason="the extra 'warp' is installed")
-def test_mjx_warp_without_its_extra_is_refused(scene):
+def test_mjx_warp_without_its_extra_is_rejected(scene):
     with pytest.raises(ValueError, match=r"needs the extra 'warp': pip install 'mjx-arm\[warp\]'"):
         make_physics(scene.mj_model, "mjx-warp", substeps=2)
 

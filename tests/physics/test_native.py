@@ -242,13 +242,13 @@ STATEFUL = """
         ({"head": '<size nuserdata="3"/>'}, "user data"),
     ],
 )
-def test_state_that_is_not_carried_is_refused(backend, parts, named):
+def test_state_that_is_not_carried_is_rejected(backend, parts, named):
     text = STATEFUL.format(**{"head": "", "world": "", "servo": "", **parts})
     with pytest.raises(ValueError, match=f"physics supports no {named}.*: remove them from"):
         make_physics(mujoco.MjModel.from_xml_string(text), backend, substeps=1)
 
 
-def test_plugins_are_refused(scene):
+def test_plugins_are_rejected(scene):
     class WithPlugin:
         nplugin = 1
         nmocap = nhistory = nuserdata = 0
@@ -258,7 +258,7 @@ def test_plugins_are_refused(scene):
         check_model(WithPlugin)
 
 
-def test_a_model_that_no_batch_can_run_is_refused(scene, monkeypatch):
+def test_a_model_that_no_batch_can_run_is_rejected(scene, monkeypatch):
     def fail(*args, **kwargs):
         raise ValueError("no batch\nfor this")
 
@@ -269,7 +269,7 @@ def test_a_model_that_no_batch_can_run_is_refused(scene, monkeypatch):
 
 @pytest.mark.parametrize("substeps", [2.9, 2.0, 0, -1, True, "2", None, np.nan])
 @pytest.mark.parametrize("backend", ["native", "mjx"])
-def test_substeps_that_are_no_count_are_refused(scene, backend, substeps):
+def test_substeps_that_are_no_count_are_rejected(scene, backend, substeps):
     with pytest.raises(ValueError, match="substeps must be a whole number of at least 1, got"):
         make_physics(scene.mj_model, backend, substeps=substeps)
 

@@ -346,7 +346,7 @@ def difference(ids, one, other) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize("backend", ["native", "mjx"])
-class TestRefusals:
+class TestRejections:
     """Named when the physics is made, or when it is traced."""
 
     @pytest.mark.parametrize(

@@ -46,7 +46,7 @@ def _model(world: str, assets: str = "") -> str:
         ),
     ],
 )
-def test_load_scene_refuses_by_name(
+def test_load_scene_rejects_by_name(
     world: str, assets: str, parts: tuple[str, ...], tmp_path: Path
 ) -> None:
     path = tmp_path / "scene.xml"

@@ -91,7 +91,7 @@ SUN = '<light name="sun" type="directional" {}/>'
         ('<camera name="side"/>', r"unknown camera 'front': the scene has \['side'\]"),
     ],
 )
-def test_what_cannot_be_rendered_is_refused_by_name(world: str, message: str) -> None:
+def test_what_cannot_be_rendered_is_rejected_by_name(world: str, message: str) -> None:
     scene = scene_of(f"<mujoco><worldbody>{world}</worldbody></mujoco>")
     with pytest.raises(ValueError, match=message) as error:
         make_renderer(scene)

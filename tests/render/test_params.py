@@ -268,7 +268,7 @@ def test_a_moving_camera_demands_its_pose() -> None:
         ({"cam_sensorsize": (0,)}, "'cam_sensorsize' changes the image"),
     ],
 )
-def test_what_cannot_vary_is_refused_by_name(
+def test_what_cannot_vary_is_rejected_by_name(
     primitives: Scene, varies: dict[str, tuple[int, ...]], message: str
 ) -> None:
     with pytest.raises(ValueError, match=message) as error:
@@ -276,7 +276,7 @@ def test_what_cannot_vary_is_refused_by_name(
     assert "\n" not in str(error.value)
 
 
-def test_params_that_do_not_fit_are_refused_by_name(primitives: Scene) -> None:
+def test_params_that_do_not_fit_are_rejected_by_name(primitives: Scene) -> None:
     data = at(primitives.mj_model)
     render = make_renderer(primitives, size=(8, 8), varies={"light_dir": (0,)})
     with pytest.raises(ValueError, match="params lacks 'light_dir'"):

@@ -43,7 +43,7 @@ def test_an_unknown_camera_is_named(arm: Scene) -> None:
         make_renderer(arm, camera="side")
 
 
-def test_a_batch_without_vmap_is_refused(arm: Scene) -> None:
+def test_a_batch_without_vmap_is_rejected(arm: Scene) -> None:
     xpos, xmat = geom_poses(arm.mj_model, random_qpos(arm.mj_model, 2, seed=15))
     with pytest.raises(ValueError, match=r"geom_xpos \[2, .*jax.vmap"):
         make_renderer(arm)(xpos, xmat)

@@ -55,7 +55,7 @@ def test_several_samples_are_the_mean_of_a_larger_image(arm: Scene, samples: int
 
 
 @pytest.mark.parametrize("samples", [0, 2, 9, True, 4.5, "4"])
-def test_other_numbers_of_samples_are_refused(arm: Scene, samples) -> None:
+def test_other_numbers_of_samples_are_rejected(arm: Scene, samples) -> None:
     with pytest.raises(ValueError, match="samples must be 1, 4 or 16 rays through a pixel, got"):
         make_renderer(arm, samples=samples)
 

@@ -236,7 +236,9 @@ def test_a_moving_box_has_its_texture() -> None:
         ),
     ],
 )
-def test_textures_that_cannot_be_rendered_are_refused(geom: str, assets: str, message: str) -> None:
+def test_textures_that_cannot_be_rendered_are_rejected(
+    geom: str, assets: str, message: str
+) -> None:
     with pytest.raises(ValueError, match=message) as error:
         textured(f'{ABOVE}<geom {geom} material="m"/>', assets)
     assert "\n" not in str(error.value)

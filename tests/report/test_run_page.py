@@ -102,7 +102,7 @@ def test_the_page_of_several_seeds_links_to_theirs(tmp_path):
 
 
 @pytest.mark.parametrize("text", ["{", "[]", "{}", '{"ci95": [0, 1], "episodes": "many"}'])
-def test_a_damaged_evaluation_is_refused(text, tmp_path):
+def test_a_damaged_evaluation_is_rejected(text, tmp_path):
     (tmp_path / "evaluation.json").write_text(text)
     with pytest.raises(ValueError, match=r"evaluation\.json is damaged: remove it"):
         read_evaluation(tmp_path)

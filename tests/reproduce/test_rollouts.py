@@ -72,12 +72,12 @@ def test_random_actions_are_recorded(rollouts):
 
 
 @pytest.mark.parametrize(("episodes", "epsilon"), [(0, 0.1), (1, 1.5)])
-def test_bad_numbers_are_refused(env, params, episodes, epsilon):
+def test_bad_numbers_are_rejected(env, params, episodes, epsilon):
     with pytest.raises(ValueError, match="must be"):
         roll_out(env, apply, params, episodes=episodes, epsilon=epsilon, key=jax.random.key(0))
 
 
-def test_another_task_is_refused(params):
+def test_another_task_is_rejected(params):
     env = make("A", task="reach", observation="state", physics="native")
     with pytest.raises(ValueError, match="of the task 'lift', got 'reach'"):
         roll_out(env, apply, params, episodes=1, epsilon=0.0, key=jax.random.key(0))

@@ -53,14 +53,14 @@ def test_an_agent_of_a_run_takes_the_place_of_the_shipped_one(tmp_path):
     assert "taught-B-seed0" not in names
 
 
-def test_two_runs_of_one_seed_are_refused(tmp_path):
+def test_two_runs_of_one_seed_are_rejected(tmp_path):
     for name in ("one", "two"):
         make_run(tmp_path / name, env="B")
     with pytest.raises(ValueError, match="are both pixels-B-seed0: leave one of them out"):
         merge(find_runs(tmp_path), [])
 
 
-def test_seeds_with_different_options_are_refused(tmp_path):
+def test_seeds_with_different_options_are_rejected(tmp_path):
     make_run(tmp_path / "one", env="B")
     make_run(tmp_path / "two", env="B", seed=1, learning_rate=1e-3)
     with pytest.raises(ValueError, match=r"such as learning_rate = 0\.0003 and 0\.001"):
@@ -68,7 +68,7 @@ def test_seeds_with_different_options_are_refused(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["nowhere", "empty"])
-def test_a_folder_without_runs_is_refused(tmp_path, name):
+def test_a_folder_without_runs_is_rejected(tmp_path, name):
     (tmp_path / "empty").mkdir()
     with pytest.raises(ValueError, match=f"--runs .*{name} "):
         find_runs(tmp_path / name)

@@ -43,12 +43,12 @@ def test_a_dimension_is_read(text, expected):
         (["n-step=1,2", "n-step=3..4"], "--search names n-step twice: give it once"),
     ],
 )
-def test_what_cannot_be_varied_is_refused(texts, message):
+def test_what_cannot_be_varied_is_rejected(texts, message):
     with pytest.raises(ValueError, match=re.escape(message)):
         parse_space(texts, CONFIG)
 
 
-def test_values_that_do_not_fit_the_other_options_are_refused():
+def test_values_that_do_not_fit_the_other_options_are_rejected():
     config = train_config(replay_size=1_000)
     with pytest.raises(ValueError, match="replay_size must be at least batch_size = 2000"):
         check_space(parse_space(["batch-size=32,2000"], config), config)

@@ -172,6 +172,13 @@ def test_a_path_that_is_none_is_rejected(path):
         load_agent(path)
 
 
+def test_an_agent_of_the_first_version_is_named(tmp_path):
+    path = tmp_path / "best.agent"
+    path.write_bytes(b"anything")
+    with pytest.raises(ValueError, match=r"best\.agent is an agent of mjx_arm 0\.1, which this"):
+        load_agent(path)
+
+
 def test_an_epsilon_that_is_no_share_is_rejected(agent_file):
     agent = load_agent(agent_file)
     for epsilon in (float("nan"), -0.1, 1.1, "0.1", True, None):

@@ -151,7 +151,7 @@ CONFIG = train_config(observation="state", num_envs=8, batch_size=12)
         ({"num_seeds": 2}, 3, "num_envs must be a multiple"),
     ],
 )
-def test_devices_that_do_not_divide_the_work_are_refused(options, devices, message):
+def test_devices_that_do_not_divide_the_work_are_rejected(options, devices, message):
     with pytest.raises(ValueError, match=message):
         check_division(set_train_options(CONFIG, options), devices)
 
@@ -169,7 +169,7 @@ def test_one_device_is_the_program_without_a_mesh():
         make_mesh(2)
 
 
-def test_a_mesh_of_two_axes_is_refused():
+def test_a_mesh_of_two_axes_is_rejected():
     mesh = jax.make_mesh((1, 1), ("a", "b"))
     with pytest.raises(ValueError, match="mesh must have one axis"):
         shard_of(mesh)
@@ -177,7 +177,7 @@ def test_a_mesh_of_two_axes_is_refused():
         make_trainer(CONFIG, mesh=mesh)
 
 
-def test_an_own_algorithm_that_averages_nothing_is_refused():
+def test_an_own_algorithm_that_averages_nothing_is_rejected():
     check_takes_shard(lambda config, env, *, shard: None, 2)
     with pytest.raises(ValueError, match=r"\(config, env, \*, shard\)"):
         check_takes_shard(lambda config, env: None, 2)

@@ -71,7 +71,7 @@ def test_newcombe_interval_is_that_of_the_paper():
 
 
 @pytest.mark.parametrize(("option", "value"), [("episodes", 0), ("epsilon", 1.5)])
-def test_bad_options_are_refused(env, option, value):
+def test_bad_options_are_rejected(env, option, value):
     options = {"episodes": 1, "epsilon": 0.1, option: value}
     with pytest.raises(ValueError, match=option):
         evaluate(env, fake_policy, None, key=jax.random.key(0), **options)

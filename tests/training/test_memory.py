@@ -22,7 +22,7 @@ PLAN = {"learner": 1, "envs": 2, "obs": 3, "replay": 4, "working": 5}
         ("working", "batch size"),
     ],
 )
-def test_a_refusal_names_the_setting_that_takes_the_most(part, setting, monkeypatch):
+def test_a_rejection_names_the_setting_that_takes_the_most(part, setting, monkeypatch):
     monkeypatch.setattr(memory, "free_memory", lambda: 2 * 10**9)
     check_memory(PLAN)
     with pytest.raises(ValueError, match=f"{part} 3.00 GB, and 2.00 GB are free.*{setting}"):

@@ -107,13 +107,13 @@ def test_a_missing_one_is_asked_for_by_name(own):
         check_record(found, train_config(), Objects(), "here")
 
 
-def test_a_different_one_is_refused(own):
+def test_a_different_one_is_rejected(own):
     found = record(train_config(), Objects(reward=own.reward))
     with pytest.raises(ValueError, match="made with reward=own_parts:reward, got own_parts:other"):
         check_record(found, train_config(), Objects(reward=own.other), "here")
 
 
-def test_an_unexpected_one_is_refused(own):
+def test_an_unexpected_one_is_rejected(own):
     with pytest.raises(ValueError, match="made without reward=, got own_parts:reward"):
         check_record({}, train_config(), Objects(reward=own.reward), "here")
 
@@ -127,7 +127,7 @@ def change_source(own, tmp_path, old="0.0 *", new="1.0 *") -> None:
     importlib.reload(own)
 
 
-def test_changed_source_is_refused(own, tmp_path):
+def test_changed_source_is_rejected(own, tmp_path):
     found = record(train_config(), Objects(reward=own.reward))
     change_source(own, tmp_path)
     with pytest.raises(ValueError, match="reward=own_parts:reward, whose source has changed"):
@@ -248,7 +248,7 @@ def test_a_command_line_does_not_start_from_a_configuration_without_its_objects(
     assert parsed.options.network.network == "own_parts:Net"
 
 
-def test_what_a_command_line_cannot_name_is_refused(tmp_path, capsys):
+def test_what_a_command_line_cannot_name_is_rejected(tmp_path, capsys):
     config = train_config()
     objects = Objects(env=OwnEnv(config.env, None))
     save_run(tmp_path, SavedRun(config, record(config, objects), load_scene("arm_cube").source))
@@ -257,7 +257,7 @@ def test_what_a_command_line_cannot_name_is_refused(tmp_path, capsys):
 
 
 @pytest.mark.parametrize("values", [5, ["reward"], {"reward": "own"}, {"reward": {"given": 3}}])
-def test_a_record_that_is_none_is_refused(values):
+def test_a_record_that_is_none_is_rejected(values):
     with pytest.raises(ValueError, match=r"some\.json: 'objects' must be the record of a run, got"):
         parse_record(values, "some.json")
 

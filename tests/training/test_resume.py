@@ -80,7 +80,7 @@ def assert_same_run(one: pathlib.Path, other: pathlib.Path) -> None:
             np.testing.assert_array_equal(a, b)
 
 
-def assert_refused_and_untouched(folder: pathlib.Path, message: str, capsys) -> None:
+def assert_rejected_and_untouched(folder: pathlib.Path, message: str, capsys) -> None:
     before = (folder / "metrics.jsonl").read_text()
     assert main(["train", "--resume", str(folder)]) == 2
     assert message in capsys.readouterr().err
@@ -129,7 +129,7 @@ def test_a_checkpoint_keeps_keys_and_bits(tmp_path):
         (["--env", "B"], "--env cannot change"),
     ],
 )
-def test_a_changed_option_is_refused_by_name(arguments, message, whole_run, capsys):
+def test_a_changed_option_is_rejected_by_name(arguments, message, whole_run, capsys):
     assert main(["train", "--resume", str(whole_run), *arguments]) == 2
     assert message in capsys.readouterr().err
 
@@ -189,14 +189,14 @@ def test_a_run_whose_checkpoints_are_gone_does_not_begin_again(chunks, whole_run
     assert len(lines) == 20
     # Before its first checkpoint a run begins again; one that has left agents does not.
     (folder / "metrics.jsonl").write_text("".join(lines[:chunks]))
-    assert_refused_and_untouched(folder, "holds no checkpoint to continue from", capsys)
+    assert_rejected_and_untouched(folder, "holds no checkpoint to continue from", capsys)
 
 
 def test_one_seed_of_several_is_not_resumed_alone(tmp_path, capsys):
     folder = tmp_path / "run"
     make_run(folder, successes=(90, 91))
     message = f"is one seed of several: give the folder of all, {folder}"
-    assert_refused_and_untouched(folder / "seed-0", message, capsys)
+    assert_rejected_and_untouched(folder / "seed-0", message, capsys)
 
 
 def test_a_checkpoint_of_another_device_is_read(tmp_path):
@@ -212,19 +212,19 @@ def test_a_checkpoint_of_another_device_is_read(tmp_path):
     np.testing.assert_array_equal(load_tree(path, like)["x"], np.arange(3.0))
 
 
-def test_fewer_steps_than_are_done_are_refused(whole_run, capsys):
+def test_fewer_steps_than_are_done_are_rejected(whole_run, capsys):
     before = load_config(whole_run)
     assert main(["train", "--resume", str(whole_run), "--total-steps", "400"]) == 2
     assert "--total-steps must be at least 4000, which the run has made" in capsys.readouterr().err
     assert load_config(whole_run) == before
 
 
-def test_what_holds_no_run_is_refused(tmp_path, capsys):
+def test_what_holds_no_run_is_rejected(tmp_path, capsys):
     assert main(["train", "--resume", str(tmp_path)]) == 2
     assert "is not a run folder" in capsys.readouterr().err
 
 
-def test_checkpoints_of_another_network_are_refused(whole_run):
+def test_checkpoints_of_another_network_are_rejected(whole_run):
     config = set_train_options(load_config(whole_run), {"hidden": 17})
     like = jax.eval_shape(make_trainer(config).init, jax.random.key(0))
     with pytest.raises(ValueError, match="is not a checkpoint of such a run"):

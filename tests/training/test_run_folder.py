@@ -51,7 +51,7 @@ def home(tmp_path_factory) -> pathlib.Path:
         patch.setattr(runner, "evaluate", lambda *args, **options: result)
         patch.setattr(runner, "plot_curves", lambda *args, **options: [])
         patch.setattr(runner, "record_episode", lambda *args, **options: unittest.mock.MagicMock())
-        patch.setattr(runner, "draw_episode", lambda *args: [])
+        patch.setattr(runner, "render_episode", lambda *args: [])
         patch.setattr(runner, "write_video", lambda *args: None)
         # Only the main thread may set handlers of signals.
         with concurrent.futures.ThreadPoolExecutor(1) as pool:
@@ -66,7 +66,7 @@ def copy(home, tmp_path, monkeypatch) -> pathlib.Path:
     return tmp_path / "home"
 
 
-def refusal(folder: pathlib.Path | str, capsys) -> str:
+def rejection(folder: pathlib.Path | str, capsys) -> str:
     capsys.readouterr()
     assert main(["train", "--resume", str(folder)]) == 2
     error = capsys.readouterr().err
@@ -84,7 +84,7 @@ def test_a_run_leaves_an_agent_with_its_evaluation(home):
 def test_an_edited_option_is_named(copy, capsys):
     path = copy / "run/config.json"
     path.write_text(path.read_text().replace('"gamma": 0.99', '"gamma": 0.9'))
-    assert refusal("run", capsys) == (
+    assert rejection("run", capsys) == (
         "error: run/config.json has changed since the run wrote it: gamma was 0.99 and is now 0.9; "
         "restore it\n"
     )
@@ -100,19 +100,19 @@ def test_flipped_bits_in_the_configuration_are_all_found(copy, capsys):
         flipped = bytearray(content)
         flipped[place // 8] ^= 1 << place % 8
         path.write_bytes(flipped)
-        assert "config.json" in refusal("run", capsys)
+        assert "config.json" in rejection("run", capsys)
 
 
-def test_the_configuration_of_another_run_is_refused(copy, capsys):
+def test_the_configuration_of_another_run_is_rejected(copy, capsys):
     run = load_run(copy / "run")
     save_run(copy / "run", dataclasses.replace(run, run_id="another"))
-    assert "is a checkpoint of another run" in refusal("run", capsys)
+    assert "is a checkpoint of another run" in rejection("run", capsys)
 
 
 def test_a_run_in_an_edited_scene_is_not_continued(copy, capsys):
     scene = copy / "desk.xml"
     scene.write_text(scene.read_text().replace("</mujoco>", "\n</mujoco>"))
-    assert refusal("run", capsys) == (
+    assert rejection("run", capsys) == (
         "error: the scene 'desk.xml' has changed since the run in run was started: restore it\n"
     )
 
@@ -204,7 +204,7 @@ def test_a_folder_has_one_process_at_a_time(copy, capsys):
     )  # fmt: skip
     assert process.stdout is not None
     assert process.stdout.readline() == "locked\n"
-    assert refusal("run", capsys) == (
+    assert rejection("run", capsys) == (
         "error: run is in use by another process: wait until it ends, or give another folder\n"
     )
     process.communicate("", timeout=60)
@@ -234,13 +234,13 @@ def test_a_damaged_line_of_metrics_is_named(damage, copy):
 
 
 @pytest.mark.parametrize("value", [0, -1, 2.5, "6", True, None, float("nan")])
-def test_a_number_of_episodes_that_is_none_is_refused(value, copy):
+def test_a_number_of_episodes_that_is_none_is_rejected(value, copy):
     with pytest.raises(ValueError, match="eval_episodes must be a whole number of at least 1, got"):
         resume("run", eval_episodes=value, console=quiet())
 
 
 @pytest.mark.parametrize("value", [0.0, 1.5, "1", True, float("nan"), float("inf")])
-def test_a_rate_to_stop_at_that_is_none_is_refused(value, copy):
+def test_a_rate_to_stop_at_that_is_none_is_rejected(value, copy):
     with pytest.raises(ValueError, match="stop_at must be a finite number above 0 and of at most"):
         resume("run", stop_at=value, console=quiet())
 
@@ -254,7 +254,7 @@ def test_a_terminal_without_a_character_gets_a_question_mark(monkeypatch):
     assert raw.getvalue() == b"? 0.10\n"
 
 
-def test_training_without_compilation_is_refused(capsys):
+def test_training_without_compilation_is_rejected(capsys):
     with jax.disable_jit():
         assert main(["train", "--preset", "pixels"]) == 2
     assert "JAX_DISABLE_JIT must be unset" in capsys.readouterr().err

@@ -101,7 +101,7 @@ def quick_runs():
     """Without what the tests of the command line look at."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(runner, "record_episode", record_nothing)
-        patch.setattr(runner, "draw_episode", lambda env, episode: iter(()))
+        patch.setattr(runner, "render_episode", lambda env, episode: iter(()))
         patch.setattr(runner, "write_video", lambda path, frames: None)
         patch.setattr(runner, "evaluate", evaluate_nothing)
         yield
@@ -255,7 +255,7 @@ def test_a_lambda_trains_and_the_run_says_that_it_cannot_be_resumed(inside, tmp_
             resume(folder, total_steps=800, **parts)
 
 
-def test_a_network_with_other_actions_or_none_at_all_is_refused():
+def test_a_network_with_other_actions_or_none_at_all_is_rejected():
     trainer = make_trainer(CONFIG, network=Own(num_actions=13))
     with pytest.raises(ValueError, match=r"Q-values of shape \[4, 14\].*, got \[4, 13\]"):
         trainer.shapes()
@@ -332,13 +332,13 @@ def test_minutes_end_a_run_and_count_over_its_starts(tmp_path):
     assert [row["env_steps"] for row in read_metrics(folder)] == [80, 160, 240]
 
 
-def test_minutes_that_are_none_are_refused(tmp_path):
+def test_minutes_that_are_none_are_rejected(tmp_path):
     with pytest.raises(ValueError, match="minutes must be a finite number above 0 or None"):
         train(tmp_path / "run", minutes=0.0)
 
 
 @pytest.mark.parametrize("stop_at", [0.0, 1.5, float("nan")])
-def test_a_stop_that_is_no_share_is_refused(stop_at, tmp_path):
+def test_a_stop_that_is_no_share_is_rejected(stop_at, tmp_path):
     with pytest.raises(
         ValueError, match="stop_at must be a finite number above 0 and of at most 1 or None, got"
     ):
@@ -365,7 +365,7 @@ def test_init_from_starts_with_the_network_of_an_agent(plain, tmp_path):
         np.testing.assert_array_equal(a, b)
 
 
-def test_init_from_another_network_or_nothing_is_refused_before_a_folder_is_made(plain, tmp_path):
+def test_init_from_another_network_or_nothing_is_rejected_before_a_folder_is_made(plain, tmp_path):
     other = set_train_options(CONFIG, {"hidden": 17})
     folder = tmp_path / "run"
     with pytest.raises(ValueError, match="holds the parameters of another network than this run"):
@@ -375,7 +375,7 @@ def test_init_from_another_network_or_nothing_is_refused_before_a_folder_is_made
     assert not folder.exists()
 
 
-def test_a_folder_in_use_is_refused(plain):
+def test_a_folder_in_use_is_rejected(plain):
     from mjx_arm.training.run_folder import locked
 
     with (

@@ -19,7 +19,7 @@ def test_each_shipped_agent_is_small_and_has_a_card():
         assert "of 1,000 held-out episodes" in (AGENTS / f"{name}.md").read_text()
 
 
-def test_an_unknown_agent_is_refused_with_the_names_of_those_shipped():
+def test_an_unknown_agent_is_rejected_with_the_names_of_those_shipped():
     with pytest.raises(ValueError, match="or one of agent-a, agent-b"):
         load_agent("agent-z")
 

@@ -23,7 +23,7 @@ class TaskEntry:
       make: `(config, scene, arm) -> Task`.
       config: the class of its options.
       scene: name or path of the scene that it takes by default.
-      units: of what it measures, by name.
+      units: of the numbers that it measures, by their names.
     """
 
     make: Callable[..., Task]

@@ -72,7 +72,7 @@ class Task(Protocol):
         ...
 
     def accepts(self, poses: Poses, placement: Placement) -> jax.Array:
-        """Whether a start fits the task, `[] bool`; the arm is free already."""
+        """Whether a start fits the task, `[] bool`; asked only if the arm touches nothing."""
         ...
 
     def measure(self, state: EnvState) -> dict[str, jax.Array]:
@@ -106,7 +106,7 @@ class EasedTask(Task, Protocol):
     """A task that can make some starts easier: a curriculum over the starts."""
 
     def ease(self, key: jax.Array, qpos: jax.Array, ctrl: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Changes a start whose arm is free. Consumes the key.
+        """Changes a start in which the arm touches nothing. Consumes the key.
 
         Args:
           key: a PRNG key.

@@ -24,7 +24,7 @@ from mjx_arm.varies import Params, Varies
 
 _CUBE = "cube"
 _SQUEEZE = 0.0005
-# A pad presses where it is inside the cube, contacts being soft; this much is rounding.
+# Contacts are soft, so a pressing pad is slightly inside the cube; this much is rounding, m.
 _TOUCH = 1e-5
 # How far a pad may be from where its finger's joint says, m.
 _PAD_OFF = 1e-3
@@ -49,14 +49,15 @@ class LiftConfig(TaskConfig):
       rectangle_scale: factor on the edges of the rectangle in which the cube's places are sampled.
         An agent that trains with more than 1 has seen the places to which a cube is knocked.
       success_reward: paid once, on success.
-      distance_decay: per `distance_unit`, reward `paper`; its 0.25.
+      distance_decay: per `distance_unit`, reward `paper`; the paper's 0.25.
       distance_unit: m; the paper names none, ours is a decimetre.
       height_unit: m; the unit of the cube's height in the paper's `1 + height`.
       completion_decay: per `distance_unit`, reward `completion`.
       completion_reach: most that a step without a grasp pays, reward `completion`.
       completion_grasp: paid for a grasp at height 0, reward `completion`.
-      completion_lift: most that is paid on top for the height, with its square root: in proportion
-        to the height, the first degree of a lift is worth 2 % of a Q-value, and is not found.
+      completion_lift: most that is paid on top for the height, with its square root. In proportion
+        to the height, the first step of a lift would change the Q-value by only 2 %, and would not
+        be learnt.
     """
 
     lift: Positive = 0.3
@@ -97,7 +98,7 @@ class Lift:
         self.pad_geoms = _find_pads(scene)
         self.half_size = _check_cube(scene, self.cube_geom, arm)
         _check_fingers(scene, arm, self.pad_geoms)
-        # The same, or where it varies by episode that of the episode, m.
+        # Half the cube's edge in this episode, m.
         self._half: float | jax.Array = self.half_size
         self._centre, extent = rectangle(scene, "cube_rectangle")
         self._extent = extent * np.float32(config.rectangle_scale)
@@ -105,7 +106,7 @@ class Lift:
         self._kinematics = make_kinematics(model)
         self.varies: Varies = {}
         self.rewards: Mapping[str, Reward] = {
-            "paper": functools.partial(paper_reward, config, self.half_size),
+            "paper": functools.partial(paper_reward, config, self.cube_geom),
             "completion": functools.partial(completion_reward, config),
         }
         self.feature_scales = (*[5.0] * 3, *[1.0] * 4, *[10.0] * 3)
@@ -143,7 +144,7 @@ class Lift:
             return *self._grasp(qpos, ctrl), {}
         qpos = qpos.at[self.cube_qpos : self.cube_qpos + 2].set(placement)
         if isinstance(self._half, jax.Array):
-            # Higher or lower than the scene has it, by what the cube is larger or smaller.
+            # A larger cube lies higher, by the difference of the half edges.
             qpos = qpos.at[self.cube_qpos + 2].add(self._half - self.half_size)
         return qpos, ctrl, {}
 
@@ -152,8 +153,8 @@ class Lift:
         if self.config.in_grasp_share == 0.0 or self.config.start == "in_grasp":
             return qpos, ctrl
         eased = jax.random.bernoulli(key, self.config.in_grasp_share)
-        held = self._grasp(qpos, ctrl)
-        return jnp.where(eased, held[0], qpos), jnp.where(eased, held[1], ctrl)
+        grasping = self._grasp(qpos, ctrl)
+        return jnp.where(eased, grasping[0], qpos), jnp.where(eased, grasping[1], ctrl)
 
     def _grasp(self, qpos: jax.Array, ctrl: jax.Array) -> tuple[jax.Array, jax.Array]:
         arm, cube = self.arm, slice(self.cube_qpos, self.cube_qpos + 7)
@@ -224,11 +225,15 @@ def grasped(task: Lift, poses: Poses, ctrl: jax.Array) -> jax.Array:
 
 
 def paper_reward(
-    config: LiftConfig, half_size: float, before: Snapshot, after: Snapshot, action: jax.Array
+    config: LiftConfig, cube_geom: int, before: Snapshot, after: Snapshot, action: jax.Array
 ) -> dict[str, jax.Array]:
     """Algorithm 1 of James & Johns 2016; see `LiftConfig`. Its height is the cube's centre's."""
     del before, action
-    height = after.measured["height"] + np.float32(half_size)
+    return paper_terms(config, after, after.state.physics.poses.geom_xpos[cube_geom, 2])
+
+
+def paper_terms(config: LiftConfig, after: Snapshot, height: jax.Array) -> dict[str, jax.Array]:
+    """The terms of `paper_reward` at a height of the cube's centre above the ground, m."""
     distance = after.measured["distance"] / config.distance_unit
     return _terms(
         config,
@@ -298,7 +303,7 @@ def _find_pads(scene: Scene) -> np.ndarray:
 
 
 def _check_fingers(scene: Scene, arm: Arm, pads: np.ndarray) -> None:
-    """Refuses fingers that do not close on the grasp site by as much as their joints say."""
+    """Rejects fingers whose joints do not say how far their pads are from the grasp site."""
     model, name = scene.mj_model, scene.name
     joints = [int(np.flatnonzero(model.jnt_qposadr == place)[0]) for place in arm.finger_qpos]
     data = mujoco.MjData(model)
@@ -332,7 +337,7 @@ def _check_fingers(scene: Scene, arm: Arm, pads: np.ndarray) -> None:
 
 
 def _check_cube(scene: Scene, geom: int, arm: Arm) -> float:
-    """Half the edge of the cube, m; refuses everything else than a cube on the ground."""
+    """Half the edge of the cube, m; rejects anything but a level cube on the ground."""
     model, name = scene.mj_model, scene.name
     joint = scene.find("joint", _CUBE)
     size = model.geom_size[geom]
@@ -350,6 +355,12 @@ def _check_cube(scene: Scene, geom: int, arm: Arm) -> float:
         raise ValueError(
             f"scene {name!r}: in the keyframe 'home' the cube must lie on the ground at height 0, "
             f"its centre {half} m above it, got {rest}"
+        )
+    turn = arm.home_qpos[model.jnt_qposadr[joint] + 3 : model.jnt_qposadr[joint] + 7]
+    if np.abs(turn[1:3]).max() > 1e-3:
+        raise ValueError(
+            f"scene {name!r}: in the keyframe 'home' the cube must be level, turned about the "
+            f"vertical only, got the quaternion {turn.tolist()}"
         )
     low, high = arm.ctrl_range[arm.gripper_ctrl]
     if not low < half < high:

@@ -45,7 +45,8 @@ class PushConfig(TaskConfig):
       success_reward: paid once, on success.
       completion_reach: most that a step without success pays for the gripper near the cube, reward
         `completion`.
-      completion_push: most that it pays for the cube near the mark, reward `completion`.
+      completion_push: most that a step without success pays for the cube near the mark, reward
+        `completion`.
       completion_decay: how fast both fall with the distance, per decimetre, reward `completion`.
     """
 
@@ -57,7 +58,7 @@ class PushConfig(TaskConfig):
     completion_decay: Positive = 1.0
 
     def check(self) -> None:
-        """Refuses an episode that could start in success."""
+        """Rejects an episode that could start in success."""
         if self.start_distance <= self.threshold:
             raise ValueError(
                 f"start_distance must be above threshold = {self.threshold} m, "
@@ -84,13 +85,13 @@ class Push:
     def __init__(self, config: PushConfig, scene: Scene, arm: Arm):
         model = scene.mj_model
         self.config, self.arm = config, arm
-        self.cube_geom, self.cube_qpos = _find_cube(scene)
+        self.cube_geom, self.cube_qpos = _find_cube(scene, arm)
         self.mark_geom = find_marker(scene, _MARK, "cylinder")
         centre, extent = rectangle(scene, _RECTANGLE)
         self._low, self._high = centre - extent, centre + extent
         self._cube_radius = float(np.linalg.norm(model.geom_size[self.cube_geom]))
         self._cube_half_height = float(model.geom_size[self.cube_geom, 2])
-        # By what it lies higher than in the scene, because it is larger in the episode, m.
+        # A larger cube lies higher than in the scene, by this difference of the half heights, m.
         self._cube_raised: jax.Array | None = None
         mark = model.geom_pos[self.mark_geom].astype(np.float32)
         self._mark_height = mark[2:]
@@ -196,7 +197,7 @@ class Push:
 def completion_reward(
     config: PushConfig, before: Snapshot, after: Snapshot, action: jax.Array
 ) -> dict[str, jax.Array]:
-    """Pays for nearness, bounded, and for success alone; see `PushConfig`."""
+    """Pays a bounded amount for nearness, and on success only that; see `PushConfig`."""
     success = after.measured["success"]
     terms = {
         name: most * jnp.exp(-config.completion_decay * 10.0 * after.measured[distance])
@@ -224,8 +225,8 @@ def _norm(vectors: jax.Array) -> jax.Array:
     return jnp.sqrt(jnp.sum(jnp.square(vectors), axis=-1))
 
 
-def _find_cube(scene: Scene) -> tuple[int, int]:
-    """Geom id of the cube, and where its free joint begins in `qpos`."""
+def _find_cube(scene: Scene, arm: Arm) -> tuple[int, int]:
+    """Geom id of the cube, which lies level on the ground, and where its joint begins in `qpos`."""
     model, name = scene.mj_model, scene.name
     geom, joint = scene.find("geom", _CUBE), scene.find("joint", _CUBE)
     if model.geom_type[geom] != mujoco.mjtGeom.mjGEOM_BOX:
@@ -234,6 +235,16 @@ def _find_cube(scene: Scene) -> tuple[int, int]:
         raise ValueError(f"scene {name!r}: joint {_CUBE!r} must be a free joint")
     if model.jnt_bodyid[joint] != model.geom_bodyid[geom]:
         raise ValueError(f"scene {name!r}: joint {_CUBE!r} must move the body of geom {_CUBE!r}")
-    if model.geom_pos[geom].any():
-        raise ValueError(f"scene {name!r}: geom {_CUBE!r} must be at the origin of its body")
-    return geom, int(model.jnt_qposadr[joint])
+    if model.geom_pos[geom].any() or abs(model.geom_quat[geom][0]) < 1 - 1e-9:
+        raise ValueError(
+            f"scene {name!r}: geom {_CUBE!r} must be at the origin of its body, and not turned"
+        )
+    start = int(model.jnt_qposadr[joint])
+    pose, half = arm.home_qpos[start : start + 7], float(model.geom_size[geom, 2])
+    if abs(pose[2] - half) > 1e-3 or np.abs(pose[4:6]).max() > 1e-3:
+        raise ValueError(
+            f"scene {name!r}: in the keyframe 'home' the cube must lie level on the ground at "
+            f"height 0, its centre {half} m above it, got a height of {pose[2]:g} m and the "
+            f"quaternion {pose[3:].tolist()}"
+        )
+    return geom, start

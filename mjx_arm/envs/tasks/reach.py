@@ -46,7 +46,7 @@ class ReachConfig(TaskConfig):
     completion_decay: Positive = 1.0
 
     def check(self) -> None:
-        """Refuses an episode that could start in success."""
+        """Rejects an episode that could start in success."""
         if self.start_distance <= self.threshold:
             raise ValueError(
                 f"start_distance must be above threshold = {self.threshold} m, "
@@ -150,7 +150,7 @@ class Reach:
 def completion_reward(
     config: ReachConfig, before: Snapshot, after: Snapshot, action: jax.Array
 ) -> dict[str, jax.Array]:
-    """Pays for being near the target, bounded, and for success alone; see `ReachConfig`."""
+    """Pays a bounded amount for nearness, and on success only that; see `ReachConfig`."""
     decimetres = after.measured["distance"] * 10.0
     reach = config.completion_reach * jnp.exp(-config.completion_decay * decimetres)
     success = after.measured["success"]

@@ -13,7 +13,7 @@ import mjx_arm
 from mjx_arm.envs.arm import resolve_arm
 from mjx_arm.envs.scripted import make_scripted_policy
 from mjx_arm.envs.state import Snapshot
-from mjx_arm.envs.tasks.lift import Lift, LiftConfig, completion_reward, grasped, paper_reward
+from mjx_arm.envs.tasks.lift import Lift, LiftConfig, completion_reward, grasped, paper_terms
 from mjx_arm.kinematics import make_kinematics
 
 GAMMA = 0.99
@@ -23,7 +23,7 @@ TOUCH_FORCE = 0.1
 LEAST_PRECISION = 0.98
 LEAST_RECALL = 0.98
 REWARDS = {
-    "paper": lambda config, *step: paper_reward(config, 0.0, *step),
+    "paper": lambda config, _, after, action: paper_terms(config, after, after.measured["height"]),
     "completion": completion_reward,
 }
 SCENE = pathlib.Path(__file__).parents[3] / "xml" / "arm_cube.xml"
@@ -63,9 +63,25 @@ def test_paper_is_algorithm_1(situation, expected):
 
 
 def test_the_papers_height_is_that_of_the_cubes_centre():
-    after = snapshot(grasped=True, height=0.2)
-    terms = paper_reward(LiftConfig(), 0.025, snapshot(), after, jnp.int32(0))
-    assert float(terms["lift"]) == pytest.approx(0.225, rel=1e-6)
+    """Of a cube that is larger in the episode, too."""
+    env = mjx_arm.make(
+        "A",
+        physics="native",
+        observation="state",
+        start="in_grasp",
+        reward="paper",
+        randomisation="standard",
+        cube_size=(1.1, 1.2),
+    )
+    _, state = jax.jit(env.reset)(jax.random.key(0))
+    half = float(state.params["geom_size"][env.varies["geom_size"].index(env.task.cube_geom), 0])
+    assert 1.1 <= half / env.task.half_size <= 1.2
+    after, transition = jax.jit(env.transition)(state, 0)
+    height = float(after.physics.poses.geom_xpos[env.task.cube_geom, 2])
+    assert float(transition.metrics["height"]) == pytest.approx(height - half, abs=1e-6)
+    assert float(transition.reward) == pytest.approx(
+        env.config.reward_scale * (1 + height), rel=1e-5
+    )
 
 
 def test_units_of_the_paper_are_options():
@@ -112,7 +128,7 @@ def test_scale_scales_every_term(start):
 
 
 @pytest.mark.parametrize("name", ["distance_unit", "height_unit", "distance_decay", "lift"])
-def test_constants_out_of_their_domain_are_refused(name):
+def test_constants_out_of_their_domain_are_rejected(name):
     with pytest.raises(ValueError, match=f"{name} must be a finite number above 0, got 0.0"):
         LiftConfig(**{name: 0.0})
 
@@ -186,7 +202,7 @@ def test_a_closed_gripper_on_top_of_the_cube_has_not_grasped_it(env):
         ('name="left_pad_0"', 'name="left_pad"', "geom|left_pad"),
     ],
 )
-def test_a_scene_without_what_the_task_needs_is_refused_by_name(tmp_path, old, new, message):
+def test_a_scene_without_what_the_task_needs_is_rejected_by_name(tmp_path, old, new, message):
     text = SCENE.read_text()
     assert old in text
     path = tmp_path / "scene.xml"
@@ -229,9 +245,13 @@ PLACE = " 0.36 0 0.025 1 0 0 0"
             "'left_pad_0' must be as far from the site 'grasp' as joint 'left_finger' says",
         ),
         ({FREE: ON_A_SLIDE, PLACE: " 0"}, "joint 'cube' must be a free joint"),
+        (
+            {PLACE: " 0.36 0 0.025 0.9659 0.2588 0 0"},
+            r"the cube must be level, turned about the vertical only, got .*0\.2588",
+        ),
     ],
 )
-def test_fingers_and_joints_that_the_task_cannot_use_are_refused_by_name(
+def test_fingers_and_joints_that_the_task_cannot_use_are_rejected_by_name(
     tmp_path, changes, message
 ):
     text = SCENE.read_text()
@@ -273,7 +293,7 @@ def test_a_second_free_body_before_the_cube_stays_where_the_keyframe_has_it(tmp_
         ({"size": [0.001] * 3}, "on the ground at height 0"),
     ],
 )
-def test_another_body_than_a_cube_is_refused_by_name(tmp_path, change, message):
+def test_another_body_than_a_cube_is_rejected_by_name(tmp_path, change, message):
     spec = mujoco.MjSpec.from_file(str(SCENE))
     cube = spec.geom("cube")
     for name, value in change.items():
@@ -327,6 +347,6 @@ def test_the_next_episode_is_eased_by_its_own_key():
 
 
 @pytest.mark.parametrize("share", [-0.1, 1.5, "half"])
-def test_a_share_that_is_none_is_refused(share):
+def test_a_share_that_is_none_is_rejected(share):
     with pytest.raises(ValueError, match="in_grasp_share must be a finite number from 0 to 1"):
         mjx_arm.make("A", in_grasp_share=share)

@@ -189,6 +189,7 @@ def test_the_replay_shows_the_mark_of_its_own_episode(env, starts, storage):
 MARK = 'pos="0.36 -0.12 0.001"'
 RECTANGLE = '"0.36 0 0.08 0.16"'
 JOINT = '<freejoint name="cube"/>'
+PLACE = " 0.36 0 0.025 1 0 0 0"
 
 
 @pytest.mark.parametrize(
@@ -203,6 +204,9 @@ JOINT = '<freejoint name="cube"/>'
         ([(RECTANGLE, '"0.36 0 0.08 -0.16"')], "half extents of 0 or more"),
         ([(RECTANGLE, '"0.36 0 0.05 0.05"')], "half diagonal of at least 0.1 m"),
         ([('<geom name="cube"', '<geom pos="0 0 0.01" name="cube"')], "at the origin of its body"),
+        ([('<geom name="cube"', '<geom euler="0 30 0" name="cube"')], "and not turned"),
+        ([(PLACE, " 0.36 0 0.03 1 0 0 0")], "level on the ground .* got a height of 0.03 m"),
+        ([(PLACE, " 0.36 0 0.025 0.9659 0.2588 0 0")], "the cube must lie level on the ground"),
         (
             [
                 (
@@ -215,7 +219,7 @@ JOINT = '<freejoint name="cube"/>'
         ([(JOINT, '<freejoint name="die"/>')], "no joint named 'cube'"),
     ],
 )
-def test_scenes_that_do_not_fit_are_refused_by_name(tmp_path, changes, message):
+def test_scenes_that_do_not_fit_are_rejected_by_name(tmp_path, changes, message):
     path = make_scene(tmp_path, *changes)
     with pytest.raises(ValueError, match=message):
         mjx_arm.make(task="push", scene=path)

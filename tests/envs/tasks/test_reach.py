@@ -221,7 +221,7 @@ BOX = '"0.35 0 0.2 0.1 0.2 0.15"'
         ([('pos="0.32 -0.12 0.3"', 'pos="0.36 0 0.2"')], "'target' must reach at least 0.1 m"),
     ],
 )
-def test_scenes_that_do_not_fit_are_refused_by_name(tmp_path, changes, message):
+def test_scenes_that_do_not_fit_are_rejected_by_name(tmp_path, changes, message):
     path = make_scene(tmp_path, *changes)
     with pytest.raises(ValueError, match=message):
         mjx_arm.make(task="reach", scene=path)
