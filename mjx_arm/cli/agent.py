@@ -16,7 +16,7 @@ from mjx_arm.devices import check_device
 from mjx_arm.envs.randomisation import RandomisationConfig
 from mjx_arm.export import check_path, image_shape, write_policy
 from mjx_arm.options import option_names
-from mjx_arm.report.video import check_video_path, render_episode, record_episode, write_video
+from mjx_arm.report.video import check_video_path, record_episode, render_episode, write_video
 from mjx_arm.training.agent import STORED, Agent, differences, load_agent
 from mjx_arm.training.evaluate import evaluate
 from mjx_arm.training.loop import EVALUATION, role_key

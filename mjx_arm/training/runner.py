@@ -41,7 +41,7 @@ from mjx_arm.report.progress import (
     say_working_memory,
 )
 from mjx_arm.report.run_page import write_report
-from mjx_arm.report.video import render_episode, record_episode, write_video
+from mjx_arm.report.video import record_episode, render_episode, write_video
 from mjx_arm.scene import Scene, compile_scene, read_source, scene_exists
 from mjx_arm.training.agent import (
     BEST,
