@@ -36,7 +36,7 @@ jax.config.update("jax_compilation_cache_max_size", 2**33)
 def pytest_configure(config: pytest.Config) -> None:
     """Lets the default tests, and the processes that they start, compile with few optimisations.
 
-    They then take 10 minutes instead of 18 on two cores. Tests with the markers `slow` and `long`
+    They then take 11 minutes instead of 18 on two cores. Tests with the markers `slow` and `long`
     compile as the product does.
     """
     if "not slow" not in config.option.markexpr:
