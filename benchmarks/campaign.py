@@ -20,7 +20,7 @@ under two hours on two cores; `tests/benchmarks/test_campaign.py` tries each at 
   Each must be accepted and come back from JSON as it was, or be rejected in one sentence.
 - `nans`: the controls of 1 % of the steps are NaN, for both storages of the replay. Those steps
   must be counted as diverged, and all parameters stay finite.
-- `locks`: two processes start in one folder at once. One must train, the other reject.
+- `locks`: two processes start in one folder at once. One must train, the other must be rejected.
 - `memory`: ten minutes of training must not need more and more memory.
 """
 
@@ -533,7 +533,9 @@ def _with_nans(env: Any) -> Any:
 
 def locks(folder: pathlib.Path, scale: float) -> Iterator[Row]:
     """Starts two processes in one folder at once."""
-    row = Row("locks", "two processes in one folder", "one trains to its end, the other rejects")
+    row = Row(
+        "locks", "two processes in one folder", "one trains to its end, the other is rejected"
+    )
     for i in range(max(1, round(10 * scale))):
         own = folder / f"run-{i}"
         pipes = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE}

@@ -43,7 +43,8 @@ def pytest_configure(config: pytest.Config) -> None:
         return
     os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = "1"
     jax.config.update("jax_disable_most_optimizations", True)
-    # From jax 0.11 on XLA does not know this flag, and aborts.
+    # With its newer emitters XLA takes twice as long to compile; from jax 0.11 on they cannot be
+    # turned off, and XLA aborts at a flag that it does not know.
     if jax.__version_info__ < (0, 11):
         flags = os.environ.get("XLA_FLAGS", "")
         os.environ["XLA_FLAGS"] = f"--xla_cpu_use_fusion_emitters=false {flags}".rstrip()
@@ -51,7 +52,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 @pytest.fixture
 def optimised() -> Iterator[None]:
-    """Compiles a test with XLA's optimisations, because it compares two programs bit for bit."""
+    """Compiles a test with XLA's optimisations, for values that must agree to their last bits."""
     before = jax.config.read("jax_disable_most_optimizations")
     jax.config.update("jax_disable_most_optimizations", False)
     yield

@@ -332,7 +332,7 @@ class DynamixelRobot:
             self._check_hardware(servo)
         if error & ~_ALERT:
             words = self._packets.getRxPacketError(error & ~_ALERT).split("] ")[-1].rstrip("!.")
-            raise RobotError(f"{self._name(servo)} rejects: {words}")
+            raise RobotError(f"{self._name(servo)} reports an error: {words}")
         return answer[0]
 
     def _read(self, servo: int, field: tuple[int, int], *, alert: bool = True) -> int:

@@ -63,7 +63,7 @@ class StandInRobot:
         except (ClosedError, GarbageError) as error:
             raise RobotError(f"what listens there is no stand-in: {error}") from error
         if hello["kind"] == "error":
-            raise RobotError(f"the stand-in rejects: {hello.get('sentence')}")
+            raise RobotError(f"the stand-in reports an error: {hello.get('sentence')}")
         if hello["kind"] != "hello":
             raise RobotError(f"the stand-in begins with {hello['kind']!r} instead of a hello")
         return hello
@@ -76,7 +76,7 @@ class StandInRobot:
                 state, data = receive(self._socket)
                 arrived = time.monotonic()
                 if state["kind"] == "error":
-                    raise GarbageError(f"the stand-in rejects: {state.get('sentence')}")
+                    raise GarbageError(f"the stand-in reports an error: {state.get('sentence')}")
                 frame = _frame(state, data, arrived)
                 with self._lock:
                     first = frame.number if first is None else first

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from typing import TypeAlias
+from typing import TypeAlias, cast
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +14,7 @@ from mjx_arm.envs.arm import Arm
 from mjx_arm.envs.collision import Collision
 from mjx_arm.envs.config import EnvConfig
 from mjx_arm.envs.state import Placement
-from mjx_arm.envs.tasks.base import Task
+from mjx_arm.envs.tasks.base import EasedTask, Task
 from mjx_arm.kinematics import Poses
 from mjx_arm.varies import Params
 
@@ -92,7 +92,7 @@ class StartSampler:
     ) -> tuple[jax.Array, jax.Array, Params]:
         qpos, ctrl, params = self._assemble(joints, placement)
         if hasattr(self.task, "ease"):
-            qpos, ctrl = self.task.ease(jax.random.fold_in(key, _EASE), qpos, ctrl)
+            qpos, ctrl = cast(EasedTask, self.task).ease(jax.random.fold_in(key, _EASE), qpos, ctrl)
         return qpos, ctrl, params
 
     def _is_free(self, joints: jax.Array, placement: Placement) -> jax.Array:

@@ -56,9 +56,9 @@ class Outcomes:
         which it was closed; None where there were none.
       closed: share of the episodes that reached the cube with the gripper open, in which it was
         closed there at least once; None where there were none.
-      closed_at: median distance from the cube's centre at which the gripper was closed and then
-        grasped the cube, m; None where it never did. An agent that closes further out than 3 cm
-        succeeds with a `close_rate` of 0.
+      close_distance: median distance between the grasp site and the cube's centre, m, where the
+        gripper closed and then grasped the cube; None where it never did. An agent that closes
+        further out than 3 cm can succeed with a `close_rate` of 0.
       grasped: share of the episodes in which the cube was grasped at some time.
       dropped: share of the episodes in which the cube was lost at a height of 1 cm or more.
       mean_length: iterations of an episode, failures included.
@@ -71,7 +71,7 @@ class Outcomes:
     reached: float
     close_rate: float | None
     closed: float | None
-    closed_at: float | None
+    close_distance: float | None
     grasped: float
     dropped: float
     mean_length: float
@@ -87,7 +87,7 @@ def summarise(traces: Sequence[Trace], env: Env) -> Outcomes:
     is_open = [_is_open(trace, env) for trace in traces]
     near = [x & (t.distance[:-1] <= NEAR_CUBE) for x, t in zip(is_open, traces, strict=True)]
     closes = [x & (t.action == env.arm.close_action) for x, t in zip(near, traces, strict=True)]
-    closed_at = [
+    close_distance = [
         float(t.distance[i]) for x, t in zip(is_open, traces, strict=True) for i in _grasps(x, t)
     ]
     open_there = sum(int(x.sum()) for x in near)
@@ -105,7 +105,7 @@ def summarise(traces: Sequence[Trace], env: Env) -> Outcomes:
         reached=share(lambda t: ((t.distance <= NEAR_CUBE) | t.grasped).any()),
         close_rate=sum(int(x.sum()) for x in closes) / open_there if open_there else None,
         closed=sum(bool(x.any()) for x in closes) / reached_open if reached_open else None,
-        closed_at=float(np.median(closed_at)) if closed_at else None,
+        close_distance=float(np.median(close_distance)) if close_distance else None,
         grasped=share(lambda t: t.grasped.any()),
         dropped=share(_dropped),
         mean_length=float(np.mean([len(trace.action) for trace in traces])),
@@ -126,7 +126,12 @@ def _is_open(trace: Trace, env: Env) -> np.ndarray:
 
 
 def _grasps(is_open: np.ndarray, trace: Trace) -> list[int]:
-    """Iterations that closed the gripper, after which it had the cube before it opened again."""
+    """Numbers of the iterations that closed the gripper and led to a grasp before it opened.
+
+    Args:
+      is_open: of `_is_open`, `[L] bool`.
+      trace: of the same episode.
+    """
     grasps = []
     for i in np.nonzero(is_open[:-1] & ~is_open[1:])[0]:
         opened = np.nonzero(is_open[i + 1 :])[0]

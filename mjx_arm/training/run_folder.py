@@ -112,7 +112,7 @@ def parse_run(text: str, where: str) -> SavedRun:
 
 
 def check_untouched(folder: pathlib.Path, run: SavedRun) -> None:
-    """Rejects to continue a run whose `config.json` was edited.
+    """Rejects a run whose `config.json` was edited.
 
     Raises:
       ValueError: it was; names the options that differ from those of the newest checkpoint.

@@ -90,7 +90,7 @@ def test_it_listens_on_the_loopback_interface_alone(server) -> None:
 
 def test_a_second_client_is_rejected_and_the_first_one_goes_on(server) -> None:
     with connect(server) as robot:
-        with pytest.raises(RobotError, match="rejects: another client drives this arm"):
+        with pytest.raises(RobotError, match="reports an error: another client drives this arm"):
             StandInRobot(server.port)
         robot.open()
         assert commands(server, 1) == [{"kind": "open"}]
@@ -190,7 +190,7 @@ def lying_client(liar: socket.socket) -> tuple[StandInRobot, socket.socket]:
         (b"x" * 100, "garbage came over the socket"),
         (({"kind": "state", "shape": [2, 4, 3], "number": 1}, b"short"), "of another size"),
         (({"kind": "state", "shape": [8], "number": "1"}, b"12345678"), "without a number"),
-        (({"kind": "error", "sentence": "no more"}, b""), "the stand-in rejects: no more"),
+        (({"kind": "error", "sentence": "no more"}, b""), "the stand-in reports an error: no more"),
     ],
 )
 def test_garbage_from_the_robot_is_one_sentence(liar, message, sentence) -> None:

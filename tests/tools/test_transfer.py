@@ -51,7 +51,7 @@ def test_episodes_are_counted_by_hand(env) -> None:
     # lifted: steps 1 and 2; dropped: 0 and 1; never_closed: 0 and 1.
     assert found.close_rate == pytest.approx(2 / 6)
     assert found.closed == pytest.approx(2 / 3)
-    assert found.closed_at == pytest.approx(0.02)  # both grasps were closed there
+    assert found.close_distance == pytest.approx(0.02)  # both grasps were closed there
     assert (found.grasped, found.dropped) == (0.5, 0.25)
     assert found.mean_length == pytest.approx((4 + 4 + 2 + 1) / 4)
 
@@ -68,8 +68,8 @@ def test_an_agent_that_closes_further_out_is_seen_to_do_so(env) -> None:
     missed = trace([0.05, 0.05, 0.05], [0, 0, 0], [0, 0, 0], [CLOSE, 1], False)
     found = summarise([far, missed], env)
     assert found.close_rate is None
-    assert found.closed_at == pytest.approx(0.04)
-    assert summarise([missed], env).closed_at is None
+    assert found.close_distance == pytest.approx(0.04)
+    assert summarise([missed], env).close_distance is None
 
 
 def test_a_gripper_that_starts_closed_has_no_rate_of_closing(env) -> None:
@@ -77,7 +77,7 @@ def test_a_gripper_that_starts_closed_has_no_rate_of_closing(env) -> None:
     found = summarise([held], env)
     assert found.close_rate is None
     assert found.closed is None
-    assert found.closed_at is None
+    assert found.close_distance is None
     opened = trace([0.01] * 4, [0] * 4, [1, 1, 0, 0], [OPEN, 0, CLOSE], False)
     assert summarise([opened], env).close_rate == 0.5
     assert summarise([opened], env).dropped == 0.0
@@ -110,8 +110,8 @@ def test_an_agent_succeeds_in_its_simulator() -> None:
     assert found.rate > 0.7
     assert found.grasped >= found.rate
     assert found.reached == 1.0
-    assert found.closed_at is not None
-    assert 0.0 < found.closed_at < 0.06  # more than the open fingers reach
+    assert found.close_distance is not None
+    assert 0.0 < found.close_distance < 0.06  # more than the open fingers reach
 
 
 @pytest.mark.slow

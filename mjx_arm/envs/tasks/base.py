@@ -114,7 +114,7 @@ class EasedTask(Task, Protocol):
           ctrl: `[nu] float32`.
 
         Returns:
-          `qpos` and `ctrl`.
+          `qpos [nq] float32` and `ctrl [nu] float32`.
         """
         ...
 

@@ -43,9 +43,9 @@ class LiftConfig(TaskConfig):
     Attributes:
       lift: height that the cube must be lifted to, above its rest, m.
       start: `home`, or `in_grasp` with the cube in the closed gripper.
-      in_grasp_share: of the episodes that start at `home`, the share in which the closed gripper
-        has the cube already, at whatever height the arm starts. A curriculum: the learner finds
-        out what a lift pays before it can grasp.
+      in_grasp_share: share of the episodes that start with the cube in the closed gripper, if
+        `start` is `home`. The arm starts where it would without the cube. A curriculum: the learner
+        finds out what a lift pays before it can grasp.
       rectangle_scale: factor on the edges of the rectangle in which the cube's places are sampled.
         An agent that trains with more than 1 has seen the places to which a cube is knocked.
       success_reward: paid once, on success.
@@ -72,6 +72,14 @@ class LiftConfig(TaskConfig):
     completion_reach: float = 0.2
     completion_grasp: float = 0.25
     completion_lift: float = 0.5
+
+    def check(self) -> None:
+        """Rejects a share of starts in the grasp where all of them are."""
+        if self.start == "in_grasp" and self.in_grasp_share > 0.0:
+            raise ValueError(
+                f"in_grasp_share must be 0 with start 'in_grasp', got {self.in_grasp_share}: "
+                "every episode starts with the cube in the gripper"
+            )
 
 
 class Lift:
@@ -150,7 +158,7 @@ class Lift:
 
     def ease(self, key: jax.Array, qpos: jax.Array, ctrl: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Puts the cube into the gripper in some episodes; see `LiftConfig.in_grasp_share`."""
-        if self.config.in_grasp_share == 0.0 or self.config.start == "in_grasp":
+        if self.config.in_grasp_share == 0.0:
             return qpos, ctrl
         eased = jax.random.bernoulli(key, self.config.in_grasp_share)
         grasping = self._grasp(qpos, ctrl)
@@ -233,7 +241,13 @@ def paper_reward(
 
 
 def paper_terms(config: LiftConfig, after: Snapshot, height: jax.Array) -> dict[str, jax.Array]:
-    """The terms of `paper_reward` at a height of the cube's centre above the ground, m."""
+    """The terms of `paper_reward`, each `[] float32`.
+
+    Args:
+      config: of the task.
+      after: the situation after the step.
+      height: of the cube's centre above the ground, `[] float32`, m.
+    """
     distance = after.measured["distance"] / config.distance_unit
     return _terms(
         config,
@@ -350,13 +364,13 @@ def _check_cube(scene: Scene, geom: int, arm: Arm) -> float:
     if model.geom_pos[geom].any() or abs(model.geom_quat[geom][0]) < 1 - 1e-9:
         raise ValueError(f"scene {name!r}: geom 'cube' must be at the origin of its body")
     half = float(size[0])
-    rest = arm.home_qpos[model.jnt_qposadr[joint] + 2]
+    start = int(model.jnt_qposadr[joint])
+    rest, turn = arm.home_qpos[start + 2], arm.home_qpos[start + 3 : start + 7]
     if abs(rest - half) > 1e-3:
         raise ValueError(
             f"scene {name!r}: in the keyframe 'home' the cube must lie on the ground at height 0, "
             f"its centre {half} m above it, got {rest}"
         )
-    turn = arm.home_qpos[model.jnt_qposadr[joint] + 3 : model.jnt_qposadr[joint] + 7]
     if np.abs(turn[1:3]).max() > 1e-3:
         raise ValueError(
             f"scene {name!r}: in the keyframe 'home' the cube must be level, turned about the "

@@ -197,7 +197,7 @@ class Push:
 def completion_reward(
     config: PushConfig, before: Snapshot, after: Snapshot, action: jax.Array
 ) -> dict[str, jax.Array]:
-    """Pays a bounded amount for nearness, and on success only that; see `PushConfig`."""
+    """Pays a bounded amount for nearness, or on success `success_reward`; see `PushConfig`."""
     success = after.measured["success"]
     terms = {
         name: most * jnp.exp(-config.completion_decay * 10.0 * after.measured[distance])

@@ -150,7 +150,7 @@ class Reach:
 def completion_reward(
     config: ReachConfig, before: Snapshot, after: Snapshot, action: jax.Array
 ) -> dict[str, jax.Array]:
-    """Pays a bounded amount for nearness, and on success only that; see `ReachConfig`."""
+    """Pays a bounded amount for nearness, or on success `success_reward`; see `ReachConfig`."""
     decimetres = after.measured["distance"] * 10.0
     reach = config.completion_reach * jnp.exp(-config.completion_decay * decimetres)
     success = after.measured["success"]

@@ -346,6 +346,11 @@ def test_the_next_episode_is_eased_by_its_own_key():
     assert 16 < jax.vmap(env.task.measure)(again)["grasped"].sum() < 48
 
 
+def test_a_share_of_starts_that_are_all_in_the_grasp_is_rejected():
+    with pytest.raises(ValueError, match="in_grasp_share must be 0 with start 'in_grasp', got 0"):
+        LiftConfig(start="in_grasp", in_grasp_share=0.3)
+
+
 @pytest.mark.parametrize("share", [-0.1, 1.5, "half"])
 def test_a_share_that_is_none_is_rejected(share):
     with pytest.raises(ValueError, match="in_grasp_share must be a finite number from 0 to 1"):
