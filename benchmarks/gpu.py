@@ -3,12 +3,14 @@
     python benchmarks/gpu.py --json DIR                     # the cells of one visit, in their order
     python benchmarks/gpu.py --json DIR --only b            # then environment B, 8 minutes
     python benchmarks/gpu.py --json DIR --only published    # then settings that others published
+    python benchmarks/gpu.py --json DIR --ahead CACHE       # the same, in less time on many cores
     JAX_PLATFORMS=cpu python benchmarks/gpu.py --store      # the CPU's values that parity needs
 
 A cell is one figure. Cells with fewer figures come first, so that none is measured twice before
 each is measured once; a repeated command appends. It needs neither a network nor orbax,
-imageio-ffmpeg, tensorboardX, gymnasium and matplotlib; `wheels.py` fetches the rest. `--tiny`
-rehearses it on a CPU.
+imageio-ffmpeg, tensorboardX, gymnasium and matplotlib; `wheels.py` fetches the rest. `--ahead`
+first compiles the programs of all cells at the same time, on as many cores as there are: a minute
+for each, one after another, is most of a visit. `--tiny` rehearses it on a CPU.
 """
 
 from __future__ import annotations
@@ -20,8 +22,11 @@ import dataclasses
 import functools
 import importlib.util
 import json
+import os
 import pathlib
 import subprocess
+import sys
+import tempfile
 import time
 import zlib
 from collections.abc import Callable, Iterator
@@ -73,10 +78,12 @@ class Visit:
     Attributes:
       tiny: whether this is a rehearsal at sizes that mean nothing.
       deadline: when the command must be done, by `time.monotonic`.
+      compiles: whether programs are compiled alone, and nothing is measured.
     """
 
     tiny: bool
     deadline: float
+    compiles: bool = False
 
     def left(self) -> float:
         """Seconds that are left."""
@@ -100,12 +107,14 @@ class Cell:
       file: the name of its file, without its ending.
       measure: takes the visit, and a function that writes what is known so far.
       seconds: the least time that it needs; with less it is not begun.
+      again: whether an earlier cell has the same programs, which are compiled ahead once.
     """
 
     name: str
     file: str
     measure: Callable[[Visit, Write], None]
     seconds: float
+    again: bool = False
 
 
 def device(visit: Visit, write: Write) -> None:
@@ -215,6 +224,8 @@ def train(visit: Visit, write: Write, *, env: str, goal: float, minutes: float) 
     key = role_key(_SEED, SELECTION)
     # The first of both is no part of the training: compiled and thrown away.
     judge(trainer.algorithm.policy(state.learner), key)
+    if visit.compiles:
+        return
     row: Row = {
         "env": env,
         "goal": goal,
@@ -281,6 +292,9 @@ def environment(
     if fence:
         env = _Fenced(**{field.name: getattr(env, field.name) for field in dataclasses.fields(env)})
     run = env_stages(env, num_envs, length)[stage]
+    if visit.compiles:
+        jax.jit(run, compiler_options=flags).lower((state, obs)).compile()
+        return
     figures = time_stage(run, (state, obs), num_envs * length, 3, flags)
     write({"num_envs": num_envs, "size": size, "backend": env.physics.backend, **figures})
 
@@ -303,6 +317,8 @@ def training(
     config = set_train_options(config, {"chunk_steps": _length(config, visit) * config.num_envs})
     with jax.default_matmul_precision(precision) if precision else contextlib.nullcontext():
         compiled = compile_training(config)
+        if visit.compiles:
+            return
         figures = time_training(compiled, 1 if visit.tiny else 3)
     row = {"num_envs": config.num_envs, "options": options, **figures}
     # Written before the memory is looked at, which takes as long again.
@@ -349,13 +365,15 @@ def _cells() -> dict[str, list[Cell]]:
             first.append(Cell(name, "throughput", measure, 90))
     for convolution in ("nn.Conv", "patches"):
         measure = part(training, num_envs=many, convolution=convolution)
-        first.append(Cell(f"convolution {convolution}", "comparisons", measure, 90))
+        again = convolution == "nn.Conv"
+        first.append(Cell(f"convolution {convolution}", "comparisons", measure, 90, again))
     for precision in ("highest", "default"):
         measure = part(training, num_envs=many, precision=precision)
-        first.append(Cell(f"precision {precision}", "comparisons", measure, 90))
+        again = precision == "default"
+        first.append(Cell(f"precision {precision}", "comparisons", measure, 90, again))
     for name, fence in (("fused", False), ("fenced", True)):
         measure = part(environment, num_envs=many, fence=fence)
-        first.append(Cell(f"ray cast {name}", "comparisons", measure, 60))
+        first.append(Cell(f"ray cast {name}", "comparisons", measure, 60, again=not fence))
     for physics in ("mjx", "mjx-warp"):
         measure = part(environment, num_envs=many, stage="physics", physics=physics)
         first.append(Cell(f"physics {physics}", "comparisons", measure, 60))
@@ -373,7 +391,7 @@ def _cells() -> dict[str, list[Cell]]:
     }
     published = [
         # Playground's PandaPickCubeCartesian: 1,024 environments of 64 by 64 pixels.
-        Cell("playground", "published", part(environment, num_envs=1_024), 60),
+        Cell("playground", "published", part(environment, num_envs=1_024), 60, again=True),
         Cell(
             "playground, physics",
             "published",
@@ -387,6 +405,44 @@ def _cells() -> dict[str, list[Cell]]:
 
 
 CELLS = _cells()
+# A program's kernels are tried on the GPU before most of the compiling, which needs cores alone: so
+# long the next one waits, that none is tried beside another's.
+_APART_S = 10
+
+
+def compile_ahead(cache: pathlib.Path, cells: list[Cell], visit: Visit) -> None:
+    """Compiles the programs of all cells, each in a process of its own, into jax's cache.
+
+    Args:
+      cache: folder of the cache, for this and later processes.
+      cells: whose programs are compiled.
+      visit: when it must be over; what is not compiled by then is compiled by its cell.
+    """
+    options = {
+        "jax_compilation_cache_dir": str(cache.resolve()),
+        "jax_persistent_cache_min_compile_time_secs": 0,
+        "jax_persistent_cache_min_entry_size_bytes": -1,
+    }
+    for name, value in options.items():
+        jax.config.update(name, value)
+    environment = os.environ | {name.upper(): str(value) for name, value in options.items()}
+    # Each takes the memory that it needs, not most of it.
+    environment["XLA_PYTHON_CLIENT_PREALLOCATE"] = "false"
+    own = [cell for cell in cells if not cell.again]
+    with tempfile.TemporaryDirectory() as nowhere:
+        command = [sys.executable, __file__, "--json", nowhere, "--compile-only"]
+        command += ["--tiny"] * visit.tiny
+        begun = []
+        for cell in own:
+            begun.append(subprocess.Popen([*command, "--cells", cell.name], env=environment))
+            time.sleep(0 if visit.tiny else _APART_S)
+        for cell, process in zip(own, begun, strict=True):
+            try:
+                if process.wait(max(visit.left(), 1)) != 0:
+                    print(f"{cell.name}: not compiled ahead", flush=True)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
 
 
 def read(folder: pathlib.Path, file: str) -> list[Row]:
@@ -399,6 +455,9 @@ def append(folder: pathlib.Path, cell: Cell) -> Write:
     """A function that writes a new row of a cell, and writes it again when it is called again."""
     before = read(folder, cell.file)
     about = {"cell": cell.name, "machine": machine(), "at": time.strftime("%Y-%m-%d %H:%M:%S")}
+    if jax.config.jax_compilation_cache_dir:
+        # `compile_s` is then the time in which a compiled program is read.
+        about["compiled_ahead"] = True
 
     def write(row: Row) -> None:
         rows = [*before, about | row]
@@ -425,12 +484,14 @@ def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--json", type=pathlib.Path, help="folder for the results")
     parser.add_argument("--only", choices=[name for name in CELLS if name], default="")
-    parser.add_argument("--cells", nargs="+", help="some of the command's cells, by name")
+    parser.add_argument("--cells", nargs="+", help="these cells, of any command")
     parser.add_argument("--minutes", type=float, default=8.5, help="begin and train no longer")
     parser.add_argument("--tiny", action="store_true", help="rehearse at sizes that mean nothing")
+    parser.add_argument("--ahead", type=pathlib.Path, help="folder for programs compiled ahead")
+    parser.add_argument("--compile-only", action="store_true", help="measure nothing")
     parser.add_argument("--store", action="store_true", help=f"write {STORED.name} from a CPU")
     options = parser.parse_args(arguments)
-    visit = Visit(options.tiny, time.monotonic() + 60 * options.minutes)
+    visit = Visit(options.tiny, time.monotonic() + 60 * options.minutes, options.compile_only)
     if options.store:
         if jax.default_backend() != "cpu":
             parser.error("--store keeps the values of a CPU: set JAX_PLATFORMS=cpu")
@@ -440,14 +501,19 @@ def main(arguments: list[str] | None = None) -> None:
         parser.error("--json must be a folder for the results, got none")
     cells = CELLS[options.only]
     if options.cells:
+        cells = [cell for command in CELLS.values() for cell in command]
         unknown = set(options.cells) - {cell.name for cell in cells}
         if unknown:
             parser.error(
                 f"--cells must be some of {[x.name for x in cells]}, got {sorted(unknown)}"
             )
         cells = [cell for cell in cells if cell.name in options.cells]
-    for cell in in_order(options.json, cells):
-        if visit.left() < cell.seconds:
+    cells = list(in_order(options.json, cells))
+    if options.ahead:
+        compile_ahead(options.ahead, cells, visit)
+    for cell in cells:
+        # What is compiled takes a third of the time.
+        if visit.left() < (cell.seconds / 3 if options.ahead else cell.seconds):
             print(f"{cell.name}: left out, {visit.left():.0f} s are left", flush=True)
             continue
         started, write = time.monotonic(), append(options.json, cell)

@@ -190,7 +190,7 @@ class DistillConfig(AlgorithmConfig):
     teacher_huber: bool = True
     teacher_dueling: bool = True
     teacher_layer_norm: bool = True
-    student_starts: CountOrZero = 1_200_000
+    student_starts: CountOrZero = 800_000
     student_batch_size: Count = 64
     student_updates_per_step: Count = 3
     student_learning_rate: Positive = 1e-3
