@@ -37,7 +37,7 @@ def pytest_configure(config: pytest.Config) -> None:
     """Lets the default tests, and the processes that they start, compile with few optimisations.
 
     They then take 11 minutes instead of 18 on two cores. Tests with the markers `slow` and `long`
-    compile as the product does.
+    compile as the product does, but for the programs of several devices or processes.
     """
     if "not slow" not in config.option.markexpr:
         return

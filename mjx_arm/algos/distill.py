@@ -230,14 +230,15 @@ class Distill:
 
         zeros = jax.tree.map(jnp.zeros_like, student.params)
         grads, (losses, agreements) = jax.lax.scan(add, zeros, rows)
-        grads = self.shard.mean(jax.tree.map(lambda x: x / parts, grads))
+        metrics = {"student_loss": jnp.mean(losses), "student_agreement": jnp.mean(agreements)}
+        grads = jax.tree.map(lambda x: x / parts, grads)
+        grads, metrics = self.shard.mean((grads, metrics))
         # Adam's bias correction raises a float to an integer power; strict promotion is for ours.
         with jax.numpy_dtype_promotion("standard"):
             changes, opt_state = self._optimizer.update(grads, student.opt_state, student.params)
         params = optax.apply_updates(student.params, changes)
         averaged = optax.incremental_update(params, student.averaged, self.config.student_polyak)
-        metrics = {"student_loss": jnp.mean(losses), "student_agreement": jnp.mean(agreements)}
-        return Student(params, opt_state, averaged, spread), self.shard.mean(metrics)
+        return Student(params, opt_state, averaged, spread), metrics
 
 
 def advantage_spread(target: jax.Array, overall: jax.Array) -> jax.Array:

@@ -117,9 +117,9 @@ class QLearning:
                 "q_mean": jnp.mean(each["q_mean"]),
                 "target_max": jnp.max(each["target_max"]),
             }
-        grads = self.shard.mean(grads)
         largest = self.shard.largest(metrics["target_max"])
-        metrics = self.shard.mean(metrics) | {"target_max": largest}
+        grads, metrics = self.shard.mean((grads, metrics))
+        metrics |= {"target_max": largest}
         # Adam's bias correction raises a float to an integer power; strict promotion is for ours.
         with jax.numpy_dtype_promotion("standard"):
             changes, opt_state = self.optimizer.update(grads, learner.opt_state, learner.params)

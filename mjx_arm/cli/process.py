@@ -14,7 +14,13 @@ from typing import NoReturn
 import jax
 
 from mjx_arm.cli.parse import parse
-from mjx_arm.training.processes import alone, end_together, is_writer, lost_sentence
+from mjx_arm.training.processes import (
+    alone,
+    end_together,
+    is_loss,
+    is_writer,
+    lost_sentence,
+)
 from mjx_arm.training.runner import RunInterruptedError, stop_signals
 
 
@@ -42,7 +48,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if "RESOURCE_EXHAUSTED" in str(error):
             advice = "give a smaller --replay-size, --num-envs or batch size"
             print(f"error: the device has run out of memory: {advice}", file=sys.stderr)
-        elif alone():
+        elif alone() or not is_loss(error):
             raise
         else:
             print(f"error: {lost_sentence(error)}", file=sys.stderr)

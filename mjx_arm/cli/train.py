@@ -18,7 +18,7 @@ from mjx_arm.report.progress import make_console
 from mjx_arm.tools.search_space import parse_space
 from mjx_arm.tools.sweep import describe_sweep, sweep
 from mjx_arm.tools.wandb_log import WandbLog, import_wandb
-from mjx_arm.training.processes import alone, is_writer, watch_others
+from mjx_arm.training.processes import alone, is_writer
 from mjx_arm.training.run_folder import load_config, new_run_folder
 from mjx_arm.training.runner import resume, train
 
@@ -76,7 +76,6 @@ class Train:
         """Runs the command; `given` are the names of the options on the command line."""
         console = make_console()
         check_device()
-        watch_others()
         if self.resume is not None:
             self._resume(self.resume, given, console)
             return

@@ -25,7 +25,7 @@ import jax.numpy as jnp
 from mjx_arm.config import dump_config, parse_config
 from mjx_arm.training.memory import tree_size
 from mjx_arm.training.mesh import place
-from mjx_arm.training.processes import is_writer, on_writer
+from mjx_arm.training.processes import is_writer, on_writer, wait_for_all
 from mjx_arm.training.seal import is_sealed, seal
 
 _KEPT = 2
@@ -303,6 +303,8 @@ class RunCheckpoints:
         if is_writer():
             for step in self.steps()[:-_KEPT]:
                 shutil.rmtree(self._path(step))
+        # The next chunk, which does not wait for long, begins in all processes at once.
+        wait_for_all()
 
     def steps(self) -> list[int]:
         """Vector steps of the checkpoints there are, the oldest first."""

@@ -23,6 +23,7 @@ from mjx_arm.options import Count, check_value
 from mjx_arm.physics import compiler_options
 from mjx_arm.shard import WHOLE, Shard
 from mjx_arm.training.mesh import fetch, replicate, shard_of, sharded
+from mjx_arm.training.processes import wait_for_all
 
 # Most environments side by side, and iterations in one compiled call.
 MAX_ENVS = 200
@@ -95,10 +96,17 @@ def make_evaluator(
     check_epsilon(epsilon)
     start, advance = make_programs(env, apply, episodes=episodes, epsilon=epsilon, mesh=mesh)
 
+    several = mesh is not None and mesh.size > len(mesh.local_devices)
+    compiled: list[Callable[..., Any]] = []
+
     def evaluate_params(params: Any, key: jax.Array) -> Evaluation:
         params, run, left = replicate(params, mesh), start(replicate(key, mesh)), 1
+        if several and not compiled:
+            compiled.append(advance.lower(params, run).compile())
+            # Processes do not compile equally long, and one that computes does not wait for long.
+            wait_for_all()
         while left > 0:
-            run, most = advance(params, run)
+            run, most = (compiled or [advance])[0](params, run)
             left = int(most)
         return _summarise(fetch(run.counts), episodes)
 

@@ -49,6 +49,18 @@ class Meeting:
           RuntimeError: the service did not start.
         """
         options = (address, number, heartbeat_timeout, shutdown_timeout)
+        # The service of a run whose process 0 was lost keeps the port for so long.
+        deadline, waits = time.monotonic() + _STAY + 5, False
+        while (said := self._start(*options)) != _READY:
+            if time.monotonic() > deadline:
+                raise RuntimeError(f"the coordination service did not start on {address}: {said}")
+            if not waits:
+                waits = True
+                sys.stderr.write(f"waiting for {address}, at most {_STAY + 5} s: {said}\n")
+            time.sleep(1)
+
+    def _start(self, *options: Any) -> str:
+        """Starts the process; what it says."""
         self.process = subprocess.Popen(
             [sys.executable, __file__, *map(str, options)],
             stdin=subprocess.PIPE,
@@ -60,12 +72,12 @@ class Meeting:
         )
         assert self.process.stdout is not None
         said = self.process.stdout.readline().strip()
-        if said != _READY:
-            self.process.kill()
-            self.process.communicate()
-            # Where the port is in use, jaxlib sometimes crashes before it can say so.
-            reason = said or "the port may be in use"
-            raise RuntimeError(f"the coordination service did not start on {address}: {reason}")
+        if said == _READY:
+            return said
+        self.process.kill()
+        self.process.communicate()
+        # Where the port is in use, jaxlib sometimes crashes before it can say so.
+        return said or "the port may be in use"
 
     def shutdown(self) -> None:
         """Ends the service, once the processes have left it."""

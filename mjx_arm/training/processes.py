@@ -6,12 +6,17 @@ With one process each function does without the others.
 
 from __future__ import annotations
 
+import contextlib
+import functools
 import itertools
+import json
 import os
 import pathlib
+import socket
 import sys
 import threading
-from collections.abc import Callable, Mapping
+import zlib
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import jax
@@ -28,12 +33,15 @@ _HEARTBEAT = 100
 _START, _END = 300, 30
 # Process 0 evaluates, renders and writes while the others wait, ms.
 _PATIENCE = 24 * 60 * 60 * 1000
-# Bytes of a text that process 0 tells the others.
-_TEXT = 65_536
 # Where a pod finds its namespace.
 _NAMESPACE = pathlib.Path("/var/run/secrets/kubernetes.io/serviceaccount/namespace")
+# Words of the errors of jax, gloo and NCCL about a process that is not there any more.
+_LOST = (
+    *("gloo", "nccl", "barrier", "heartbeat", "coordination", "connection", "peer", "socket"),
+    *("unavailable", "deadline", "timed out", "preempt", "disconnect"),
+)
 _barriers = itertools.count()
-_ending = threading.Event()
+_watches = itertools.count()
 
 
 def join_processes(
@@ -145,16 +153,14 @@ def alone() -> bool:
 
 def any_says(flag: bool) -> bool:
     """Whether the flag is set in any process; the same answer in all of them."""
-    if alone():
-        return flag
-    return bool(multihost_utils.process_allgather(np.array(flag)).any())
+    return bool(flag) if alone() else bool(_gather(np.array(flag)).any())
 
 
 def on_writer(function: Callable[[], str | None]) -> str:
     """Runs a function in process 0 alone, while the others wait.
 
     Args:
-      function: returns a short text, or None for an empty one.
+      function: returns a text, or None for an empty one.
 
     Returns:
       The text, in every process.
@@ -170,18 +176,58 @@ def on_writer(function: Callable[[], str | None]) -> str:
             text = function() or ""
         except ValueError as error:
             text, failed = str(error), True
-    # A collective gives up after half a minute; a barrier waits.
     wait_for_all()
-    content = text.encode()[:_TEXT]
-    buffer = np.zeros(_TEXT + 8, np.uint8)
-    buffer[: len(content)] = np.frombuffer(content, np.uint8)
-    buffer[_TEXT:] = np.frombuffer(np.array([len(content), failed], np.uint32).tobytes(), np.uint8)
-    buffer = np.asarray(multihost_utils.broadcast_one_to_all(buffer))
-    size, failed = np.frombuffer(buffer[_TEXT:].tobytes(), np.uint32).tolist()
-    text = buffer[:size].tobytes().decode(errors="replace")
+    content = np.frombuffer(text.encode(), np.uint8)
+    about = multihost_utils.broadcast_one_to_all(np.array([len(content), failed], np.uint32))
+    size, failed = np.asarray(about).tolist()
+    if size > 0:
+        own = content if is_writer() else np.zeros(size, np.uint8)
+        text = np.asarray(multihost_utils.broadcast_one_to_all(own)).tobytes().decode()
     if failed:
         raise ValueError(text)
     return text
+
+
+def check_same(options: Mapping[str, str]) -> None:
+    """Rejects processes that were started with different options.
+
+    They would train different networks and average their gradients, or wait for one another for
+    ever.
+
+    Args:
+      options: by name, the same names in every process.
+
+    Raises:
+      ValueError: in every process, where the value of some option is not that of process 0.
+    """
+    if alone():
+        return
+    first = json.loads(on_writer(lambda: json.dumps(dict(options))))
+    names = list(first)
+    other = [names.index(name) for name in names if options.get(name) != first[name]]
+    found = _gather(np.array(other[0] if other else -1))
+    if (found >= 0).any():
+        process = int(np.argmax(found >= 0))
+        raise ValueError(
+            f"process {process} was given another {names[found[process]]} than process 0: start "
+            "every process with the same options"
+        )
+
+
+@functools.cache
+def processes_here() -> int:
+    """Number of processes of the run on this machine. All of them must call it."""
+    if alone():
+        return 1
+    own = np.array(zlib.crc32(socket.gethostname().encode()), np.uint32)
+    return int((_gather(own) == own).sum())
+
+
+def _gather(value: np.ndarray) -> np.ndarray:
+    """The value of every process, `[processes, ...]`."""
+    # A collective gives up after half a minute; a barrier waits.
+    wait_for_all()
+    return np.asarray(multihost_utils.process_allgather(value))
 
 
 def wait_for_all() -> None:
@@ -195,30 +241,44 @@ def wait_for_all() -> None:
     multihost.get_barrier_sync_fn()(key=name, timeout_ms=_PATIENCE)
 
 
-def watch_others() -> None:
-    """Ends this process with one sentence where another one is lost, in a thread of its own.
+@contextlib.contextmanager
+def watching_others() -> Iterator[None]:
+    """Within it, this process ends with one sentence where another one is lost.
 
     A collective waits for a lost process for ever.
     """
     if alone():
+        yield
         return
     from orbax.checkpoint import multihost
 
-    meet = multihost.get_barrier_sync_fn()
+    meet, over, own = multihost.get_barrier_sync_fn(), threading.Event(), next(_watches)
 
     def watch() -> None:
         for number in itertools.count():
-            if _ending.wait(_PERIOD):
+            if over.wait(_PERIOD):
                 return
             try:
-                meet(key=f"mjx_arm_alive_{number}", timeout_ms=1_000 * _SILENCE)
+                meet(key=f"mjx_arm_alive_{own}_{number}", timeout_ms=1_000 * _SILENCE)
             except Exception as error:
-                if _ending.is_set():
+                if over.is_set():
                     return
                 os.write(2, f"error: {lost_sentence(error)}\n".encode())
                 os._exit(2)
 
     threading.Thread(target=watch, daemon=True).start()
+    try:
+        yield
+        # Else one that is done would be missed by one that is not.
+        wait_for_all()
+    finally:
+        over.set()
+
+
+def is_loss(error: Exception) -> bool:
+    """Whether an error of jax says that another process is not there any more."""
+    said = str(error).lower()
+    return any(word in said for word in _LOST)
 
 
 def lost_sentence(error: Exception) -> str:
@@ -226,7 +286,7 @@ def lost_sentence(error: Exception) -> str:
     reason = " ".join(str(error).split())[:120]
     return (
         f"the processes of the run have lost one another ({reason}): "
-        "start all of them again with --resume and the run folder"
+        "after a minute start all of them again with --resume and the run folder"
     )
 
 
@@ -240,7 +300,6 @@ def end_together(status: int) -> None:
         return
     if status in (0, 130):
         wait_for_all()
-        _ending.set()
         jax.distributed.shutdown()
         return
     # At exit jax would wait for processes that may be lost.

@@ -28,8 +28,9 @@ from mjx_arm.config import TrainConfig, advice, set_train_options
 from mjx_arm.devices import check_device
 from mjx_arm.envs.env import make_env
 from mjx_arm.envs.tasks import find_task
-from mjx_arm.options import Count, Discount, Positive, check_value
+from mjx_arm.options import Count, Discount, Positive, check_value, flat_names, get_option
 from mjx_arm.report.figures import plot_curves
+from mjx_arm.report.machine import versions
 from mjx_arm.report.metrics import MetricsWriter, keep_metrics, last_env_steps, last_wall_s
 from mjx_arm.report.progress import (
     RunProgress,
@@ -74,8 +75,16 @@ from mjx_arm.training.loop import (
 )
 from mjx_arm.training.memory import check_memory, memory_plan, working_memory
 from mjx_arm.training.mesh import fetch, make_mesh, most_devices, place, shards_seeds
-from mjx_arm.training.objects import Objects, check_record, only_here, record
-from mjx_arm.training.processes import any_says, is_writer, on_writer, wait_for_all
+from mjx_arm.training.objects import Objects, Record, check_record, only_here, record
+from mjx_arm.training.processes import (
+    any_says,
+    check_same,
+    is_writer,
+    on_writer,
+    processes_here,
+    wait_for_all,
+    watching_others,
+)
 from mjx_arm.training.run_folder import (
     EVALUATION,
     SavedRun,
@@ -122,18 +131,21 @@ class RunInterruptedError(Exception):
     """The user asked a run to stop; its state is saved."""
 
 
-def _with_rank_promotion(function: Callable[P, R]) -> Callable[P, R]:
-    """Allows rank promotion: JAX_NUMPY_RANK_PROMOTION is meant for the user's own programs."""
+def _as_run(function: Callable[P, R]) -> Callable[P, R]:
+    """Allows rank promotion, and ends where another process of the run is lost.
+
+    JAX_NUMPY_RANK_PROMOTION is meant for the user's own programs.
+    """
 
     @functools.wraps(function)
     def run(*args: P.args, **options: P.kwargs) -> R:
-        with jax.numpy_rank_promotion("allow"):
+        with jax.numpy_rank_promotion("allow"), watching_others():
             return function(*args, **options)
 
     return run
 
 
-@_with_rank_promotion
+@_as_run
 def train(
     config: TrainConfig,
     folder: str | pathlib.Path | None = None,
@@ -196,6 +208,8 @@ def train(
     trainer = _prepare(config, objects, console, devices)
     config = trainer.config
     recorded = record(config, objects)
+    ends = {"eval_episodes": eval_episodes, "stop_at": stop_at, "minutes": minutes}
+    _check_same_run(trainer, recorded, {"run": "a new one", "init_from": init_from} | ends)
     for sentence in only_here(recorded):
         console.print(f"[yellow]warning: {sentence}[/yellow]", soft_wrap=True)
     start = None if init_from is None else _read_policy(trainer, pathlib.Path(init_from))
@@ -218,7 +232,7 @@ def train(
         return _finish_on_writer(made, run, objects, ending)
 
 
-@_with_rank_promotion
+@_as_run
 def resume(
     folder: str | pathlib.Path,
     *,
@@ -277,6 +291,8 @@ def resume(
     with _locked(folder):
         console.print(f"run folder: {folder}", soft_wrap=True)
         trainer = _prepare(config, objects, console, devices, scene)
+        ends = {"eval_episodes": eval_episodes, "stop_at": stop_at, "minutes": minutes}
+        _check_same_run(trainer, saved.objects, {"run": saved.run_id, "init_from": None} | ends)
         _check_same_env(config, _with_backend(trainer.config, trainer), folder)
         checkpoints = RunCheckpoints(folder, saved.origin)
         shapes = trainer.shapes()
@@ -345,6 +361,23 @@ def _continue_files(folder: pathlib.Path, run: SavedRun, saved: SavedRun, done: 
         save_run(folder, run)
     for seed_folder in seed_folders(folder, run.config):
         keep_metrics(seed_folder, done)
+
+
+def _check_same_run(trainer: Trainer, recorded: Record, options: dict[str, Any]) -> None:
+    """Rejects processes of one run that were given different options."""
+    config, installed = trainer.config, versions()
+    # Without those that only one process can have, whose tokens differ.
+    parts = {name: entry for name, entry in recorded.items() if "only_in" not in entry}
+    all_options = {name: get_option(config, name) for name in flat_names(config)} | options
+    check_same(
+        {
+            "version": f"mjx_arm {installed['mjx-arm']}, jax {installed['jax']}",
+            "number of devices": str(_local_devices(trainer)),
+            "scene": trainer.env.scene.source.digest,
+            "object": json.dumps(parts, sort_keys=True),
+        }
+        | {name: str(value) for name, value in all_options.items()}
+    )
 
 
 def _with_backend(config: TrainConfig, trainer: Trainer) -> TrainConfig:
@@ -438,7 +471,7 @@ def _prepare(
         say_mesh(console, mesh.size, by_seed=shards_seeds(config, mesh.size))
     plan = memory_plan(trainer.shapes())
     say_memory(console, plan)
-    check_memory(plan, _local_devices(trainer))
+    check_memory(plan, _local_devices(trainer) * processes_here())
     return trainer
 
 
@@ -472,7 +505,7 @@ def _compile(trainer: Trainer, console: Console) -> RunChunk:
     working = working_memory(compiled, trainer.env.physics, simulations)
     plan = memory_plan(shapes) | {"working": working}
     say_working_memory(console, plan)
-    check_memory(plan, _local_devices(trainer))
+    check_memory(plan, _local_devices(trainer) * processes_here())
     # The first chunk waits for the other processes too, but not as patiently.
     wait_for_all()
     return compiled

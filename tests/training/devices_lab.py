@@ -17,12 +17,13 @@ import optax
 from jax.sharding import PartitionSpec as P
 
 from mjx_arm.algos import distill
-from mjx_arm.algos.dqn import QLearning
+from mjx_arm.algos.dqn import DQN, QLearning
 from mjx_arm.algos.frames import Frames
-from mjx_arm.algos.replay import Batch, Step, init_replay, sample
-from mjx_arm.config import DistillConfig, set_train_options, train_config
+from mjx_arm.algos.replay import Batch, Step, init_replay
+from mjx_arm.config import DistillConfig, DQNConfig, set_train_options, train_config
 from mjx_arm.networks import FeatureQNetwork
 from mjx_arm.presets import PRESETS
+from mjx_arm.shard import Shard
 from mjx_arm.training.evaluate import make_evaluator
 from mjx_arm.training.loop import make_train, make_trainer, run_keys
 from mjx_arm.training.memory import memory_plan
@@ -31,6 +32,7 @@ from mjx_arm.training.mesh import fetch, make_mesh, shard_of, sharded
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 
 CONFIG = train_config(
+    env="B",
     observation="state",
     physics="native",
     num_envs=8,
@@ -205,32 +207,79 @@ def exchange() -> dict:
     }
 
 
+class Apart(Shard):
+    """Averages nothing, so that each device shows what it has learnt by itself."""
+
+    def mean(self, tree):
+        return tree
+
+    def largest(self, tree):
+        return tree
+
+
+def of_features(*stored):
+    return stored[-1]["features"]
+
+
+FRAMES = Frames(of_features, of_features, of_features, of_features)
+
+
 def samples() -> dict:
-    """What each device samples from shards that all hold the same."""
+    """What each device learns by itself, from shards that all hold the same and with one key."""
     mesh = make_mesh(jax.device_count())
-    shard = shard_of(mesh)
+    shard = Apart(shard_of(mesh).axis, mesh.size)
+    nothing = jnp.zeros((2,), jnp.bool_)
+    zero = nothing.astype(jnp.float32)
+    frame = {"features": jnp.zeros((2, 5))}
+    replay = init_replay(Step(frame, nothing.astype(jnp.uint8), zero, *[nothing] * 3), 1000)
+    frame_key, reward_key = jax.random.split(jax.random.key(2))
+    steps = dataclasses.replace(
+        replay.steps,
+        frame={"features": jax.random.normal(frame_key, (1000, 2, 5))},
+        reward=jax.random.normal(reward_key, (1000, 2)),
+    )
+    replay = dataclasses.replace(replay, steps=steps, count=jnp.int32(1000))
+    network = FeatureQNetwork(3, 8, dueling=True, scales=(1.0,) * 5, layer_norm=True)
+    learning = QLearning(
+        apply=network.apply,
+        init_params=network.init,
+        optimizer=optax.sgd(0.1),
+        double=True,
+        huber=True,
+        polyak=0.1,
+        target_period=1,
+        shard=shard,
+    )
+    dqn = DQN(DQNConfig(batch_size=16, learning_starts=0), FRAMES, learning, 2)
+    config = DistillConfig(
+        teacher_batch_size=16, student_batch_size=16, student_starts=0, learning_starts=0
+    )
+    pair = Plain(config, FRAMES, learning, network, 2)
 
-    def slots(key: jax.Array) -> jax.Array:
-        nothing = jnp.zeros((2,), jnp.bool_)
-        zero = nothing.astype(jnp.float32)
-        step = Step(zero, nothing.astype(jnp.uint8), zero, nothing, nothing, nothing)
-        replay = init_replay(step, 1000)
-        frame = jnp.arange(2000, dtype=jnp.float32).reshape(1000, 2)
-        steps = dataclasses.replace(replay.steps, frame=frame)
-        replay = dataclasses.replace(replay, steps=steps, count=jnp.int32(1000))
-        return sample(replay, shard.fold(key), 16, 1, 0.9).frame[None]
+    def learn(key: jax.Array) -> list:
+        obs = steps.frame["features"][0]
+        learner = dqn.init(key, obs, None)
+        both = pair.init(key, obs, {"features": obs})
+        own = dqn.learn(key, learner, replay, jnp.int32(0))[0].params
+        taught = pair.learn(key, both, replay, jnp.int32(0))[0]
+        return jax.tree.map(lambda x: x[None], [own, taught.teacher.params, taught.student.params])
 
-    found = jax.jit(sharded(slots, mesh, P(), P(shard.axis)))(jax.random.key(0))
-    return {"slots": np.asarray(found).tolist()}
+    found = jax.jit(sharded(learn, mesh, P(), P(shard.axis)))(jax.random.key(0))
+    pairs = list(itertools.combinations(range(mesh.size), 2))
+
+    def of(tree, device: int):
+        return jax.tree.map(lambda x: x[device], tree)
+
+    return {
+        "nearest": [
+            min(gap(of(tree, one), of(tree, other)) for one, other in pairs) for tree in found
+        ]
+    }
 
 
 def updates() -> dict:
     """Three updates of each learner from the same samples, on 1, 2 and 4 devices."""
 
-    def features(*stored):
-        return stored[-1]["features"]
-
-    frames = Frames(features, features, features, features)
     network = FeatureQNetwork(3, 8, dueling=True, scales=(1.0,) * 5, layer_norm=True)
     keys = jax.random.split(jax.random.key(1), 6)
     rows = (3, 16)
@@ -259,7 +308,7 @@ def updates() -> dict:
             target_period=1,
             shard=shard,
         )
-        pair = Plain(DistillConfig(student_polyak=0.1), frames, learning, network, 4)
+        pair = Plain(DistillConfig(student_polyak=0.1), FRAMES, learning, network, 4)
 
         def learn(batch, obs, next_obs, learning=learning, pair=pair):
             learner = learning.init(keys[4], obs[0])

@@ -34,6 +34,16 @@ def main(
         processes.on_writer(fail)
     except ValueError as error:
         found["failed"] = str(error)
+    # Longer than one message was once allowed to be.
+    found["length"] = len(processes.on_writer(lambda: "ä" * 70_000))
+    processes.check_same({"seed": "1", "steps": "2"})
+    try:
+        processes.check_same({"seed": "1", "steps": str(jax.process_index())})
+    except ValueError as error:
+        found["other"] = str(error)
+    found["here"] = processes.processes_here()
+    with processes.watching_others():
+        pass
     mesh = make_mesh(jax.local_device_count())
     assert mesh is not None
     found["devices"] = mesh.size

@@ -26,7 +26,9 @@ def four_devices(*checks: str, timeout: float = 600) -> dict:
     flags = f"--xla_force_host_platform_device_count={DEVICES}"
     done = subprocess.run(
         [sys.executable, "-W", "error", str(LAB), *checks],
-        env=os.environ | {"XLA_FLAGS": flags, "PYTHONPATH": str(ROOT)},
+        # Most of its time is compiling.
+        env=os.environ
+        | {"XLA_FLAGS": flags, "PYTHONPATH": str(ROOT), "JAX_DISABLE_MOST_OPTIMIZATIONS": "1"},
         capture_output=True,
         text=True,
         timeout=timeout,
@@ -80,11 +82,13 @@ def test_an_evaluation_does_not_depend_on_the_number_of_devices(lab):
 
 
 def test_devices_sample_different_batches(lab):
-    slots = [set(map(float, row)) for row in lab["samples"]["slots"]]
-    assert len(slots) == DEVICES
-    for index, one in enumerate(slots):
-        for other in slots[index + 1 :]:
-            assert len(one & other) < 4
+    # The Q-network, the teacher and the student.
+    assert len(lab["samples"]["nearest"]) == 3
+    assert min(lab["samples"]["nearest"]) > 1e-3
+
+
+def test_devices_start_different_episodes(lab):
+    assert lab["training"]["different_starts"] == 8
 
 
 def test_updates_from_the_same_samples_agree(lab):
@@ -115,7 +119,7 @@ def test_a_student_that_sees_pixels_learns_and_acts_on_all_devices():
     assert found["gap"] < 1e-5
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_seeds_are_spread_where_their_number_allows_it():
     found = four_devices("seeds")["seeds"]
     assert found["spread"] == "P('device',)"

@@ -8,6 +8,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 
 import pytest
 
@@ -39,13 +40,26 @@ def test_the_service_ends_when_the_meeting_is_over():
     assert not listens(port)
 
 
-def test_a_port_in_use_is_an_error():
+def test_a_port_in_use_is_an_error(monkeypatch):
+    monkeypatch.setattr(meeting, "_STAY", -5)
     with socket.socket() as other:
         other.bind(("localhost", 0))
         other.listen()
         address = f"localhost:{other.getsockname()[1]}"
         with pytest.raises(RuntimeError, match=rf"did not start on {address}: [A-Zt]"):
             meeting.Meeting(address, 2, heartbeat_timeout=100, shutdown_timeout=5)
+
+
+def test_the_service_waits_for_a_port_that_becomes_free(capsys):
+    with socket.socket() as other:
+        other.bind(("localhost", 0))
+        other.listen()
+        port = other.getsockname()[1]
+        threading.Timer(2, other.close).start()
+        service = meeting.Meeting(f"localhost:{port}", 2, heartbeat_timeout=100, shutdown_timeout=5)
+    assert listens(port)
+    service.shutdown()
+    assert f"waiting for localhost:{port}, at most 65 s" in capsys.readouterr().err
 
 
 def test_the_service_outlives_a_lost_process_and_its_signals():

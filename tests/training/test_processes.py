@@ -23,7 +23,7 @@ from mjx_arm.report.metrics import read_metrics
 from mjx_arm.training import processes
 from mjx_arm.training.checkpoint import RunCheckpoints
 from mjx_arm.training.loop import make_trainer, run_keys
-from mjx_arm.training.processes import detects_processes, join_processes
+from mjx_arm.training.processes import detects_processes, is_loss, join_processes
 from mjx_arm.training.run_folder import load_config
 
 LAB = pathlib.Path(__file__).with_name("processes_lab.py")
@@ -46,6 +46,8 @@ DISTILL = [
     *("--widths", "4", "4", "4", "--teacher-hidden", "16", "--teacher-batch-size", "16"),
     *("--student-batch-size", "8", "--student-starts", "160", "--select-every", "0"),
 ]
+# Most of the time of a process here is compiling.
+OWN = {"PYTHONPATH": str(ROOT), "JAX_DISABLE_MOST_OPTIMIZATIONS": "1"}
 _started: list[subprocess.Popen] = []
 
 
@@ -63,7 +65,7 @@ def spawn(command: Sequence[str], devices: int, **environment: str) -> subproces
     flags = f"--xla_force_host_platform_device_count={devices}"
     process = subprocess.Popen(
         [sys.executable, *command],
-        env=os.environ | {"XLA_FLAGS": flags, "PYTHONPATH": str(ROOT)} | environment,
+        env=os.environ | OWN | {"XLA_FLAGS": flags} | environment,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
@@ -72,12 +74,15 @@ def spawn(command: Sequence[str], devices: int, **environment: str) -> subproces
     return process
 
 
-def start(*command: str, number: int = 2, devices: int = 2) -> list[subprocess.Popen]:
-    """Starts the processes of one program, which takes its place among them as options."""
+def free_port() -> int:
     with socket.socket() as free:
         free.bind(("localhost", 0))
-        port = free.getsockname()[1]
-    place = [f"localhost:{port}", str(number)]
+        return free.getsockname()[1]
+
+
+def start(*command: str, number: int = 2, devices: int = 2) -> list[subprocess.Popen]:
+    """Starts the processes of one program, which takes its place among them as options."""
+    place = [f"localhost:{free_port()}", str(number)]
     if command[0] == "-m":
         place = ["--coordinator", place[0], "--num-processes", place[1], "--process-id"]
     return [spawn([*command, *place, str(i)], devices) for i in range(number)]
@@ -139,6 +144,10 @@ def assert_agreed(started: list[subprocess.Popen]) -> None:
         "one": True,
         "none": False,
         "failed": "only process 0 can say this",
+        "length": 70_000,
+        "other": "process 1 was given another steps than process 0: start every process with the "
+        "same options",
+        "here": 2,
         "devices": 4,
         "key": [0, 3],
     }
@@ -269,6 +278,34 @@ def test_invalid_options_are_one_sentence(options, message, capsys):
     assert error.count("\n") == 1
 
 
+def test_processes_with_different_options_end_with_one_sentence(tmp_path):
+    folder = tmp_path / "run"
+    place = ["--coordinator", f"localhost:{free_port()}", "--num-processes", "2", "--process-id"]
+    command = ["-m", "mjx_arm", "train", *OPTIONS, *TOTAL, "--out", str(folder)]
+    ended = finish([spawn([*command, "--seed", i, *place, i], 2) for i in ("0", "1")])
+    for status, _, error in ended:
+        assert status == 2
+        assert error == (
+            "error: process 1 was given another seed than process 0: start every process with the "
+            "same options\n"
+        )
+    assert not folder.exists()
+
+
+@pytest.mark.parametrize(
+    ("said", "lost"),
+    [
+        ("UNKNOWN: Gloo all-reduce failed: Connection closed by peer [127.0.0.1]:4000", True),
+        ("DEADLINE_EXCEEDED: Barrier timed out. Id: mjx_arm_alive_0_3", True),
+        ("NCCL operation ncclAllReduce failed: remote process exited", True),
+        ("INTERNAL: CpuCallback error: ValueError: the scene is gone", False),
+        ("INVALID_ARGUMENT: Mosaic failed to compile", False),
+    ],
+)
+def test_only_a_lost_process_is_called_lost(said, lost):
+    assert is_loss(jax.errors.JaxRuntimeError(said)) is lost
+
+
 def test_one_process_is_no_meeting():
     join_processes("host:1", 1, 0)
     assert not jax.distributed.is_initialized()
@@ -322,7 +359,7 @@ def test_a_signal_to_one_of_two_processes_stops_both_and_two_resume(tmp_path, ca
     assert [row["env_steps"] for row in read_metrics(folder)] == list(range(160, done + 321, 160))
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_two_killed_processes_are_resumed_by_two(tmp_path):
     """With the default preset, whose student sees pixels."""
     folder = tmp_path / "run"
