@@ -27,6 +27,7 @@ import pathlib
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 import zlib
 from collections.abc import Callable, Iterator
@@ -35,7 +36,13 @@ from typing import Any
 import jax
 import numpy as np
 from machine import machine
-from throughput import compile_training, env_stages, peak_memory, time_stage, time_training
+from throughput import (
+    compile_training,
+    env_stages,
+    peak_memory_apart,
+    time_stage,
+    time_training,
+)
 
 import mjx_arm
 from mjx_arm.config import TrainConfig, set_train_options
@@ -320,10 +327,23 @@ def training(
         if visit.compiles:
             return
         figures = time_training(compiled, 1 if visit.tiny else 3)
-    row = {"num_envs": config.num_envs, "options": options, **figures}
-    # Written before the memory is looked at, which takes as long again.
-    write(row)
-    write(row | peak_memory(compiled))
+    write({"num_envs": config.num_envs, "options": options, **figures})
+    if not (options or visit.tiny):
+        # The device never forgets a peak, so another process looks at it, and takes what it needs.
+        with _environment(XLA_PYTHON_CLIENT_PREALLOCATE="false"):
+            write(peak_memory_apart(config))
+
+
+@contextlib.contextmanager
+def _environment(**variables: str) -> Iterator[None]:
+    """Variables of the environment for the processes that are started within it."""
+    before = dict(os.environ)
+    os.environ.update(variables)
+    try:
+        yield
+    finally:
+        os.environ.clear()
+        os.environ.update(before)
 
 
 def _with_own_ratio(num_envs: int) -> dict[str, int]:
@@ -341,7 +361,7 @@ def _cells() -> dict[str, list[Cell]]:
     first = [
         Cell("device", "device", device, 1),
         Cell("parity", "parity", parity, 20),
-        Cell("a", "train-a", part(train, env="A", goal=0.95, minutes=4.0), 120),
+        Cell("a", "train-a", part(train, env="A", goal=0.95, minutes=4.0), 270),
     ]
     many = 8_192
     for num_envs in (many, 1_024):
@@ -400,7 +420,7 @@ def _cells() -> dict[str, list[Cell]]:
         ),
         Cell("squint", "published", part(training, num_envs=1_024, **squint), 90),
     ]
-    b = [Cell("b", "train-b", part(train, env="B", goal=1.1, minutes=8.0), 120)]
+    b = [Cell("b", "train-b", part(train, env="B", goal=1.1, minutes=8.0), 270)]
     return {"": first, "b": b, "published": published}
 
 
@@ -408,6 +428,8 @@ CELLS = _cells()
 # A program's kernels are tried on the GPU before most of the compiling, which needs cores alone: so
 # long the next one waits, that none is tried beside another's.
 _APART_S = 10
+# So long a cell may go on after the minutes of a command, which with the default ends before 9.
+_GRACE_S = 20
 
 
 def compile_ahead(cache: pathlib.Path, cells: list[Cell], visit: Visit) -> None:
@@ -425,9 +447,10 @@ def compile_ahead(cache: pathlib.Path, cells: list[Cell], visit: Visit) -> None:
     }
     for name, value in options.items():
         jax.config.update(name, value)
-    environment = os.environ | {name.upper(): str(value) for name, value in options.items()}
+    # Also for the processes that cells start.
+    os.environ.update({name.upper(): str(value) for name, value in options.items()})
     # Each takes the memory that it needs, not most of it.
-    environment["XLA_PYTHON_CLIENT_PREALLOCATE"] = "false"
+    environment = os.environ | {"XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
     own = [cell for cell in cells if not cell.again]
     with tempfile.TemporaryDirectory() as nowhere:
         command = [sys.executable, __file__, "--json", nowhere, "--compile-only"]
@@ -452,15 +475,16 @@ def read(folder: pathlib.Path, file: str) -> list[Row]:
 
 
 def append(folder: pathlib.Path, cell: Cell) -> Write:
-    """A function that writes a new row of a cell, and writes it again when it is called again."""
-    before = read(folder, cell.file)
+    """A function that writes a new row of a cell, and adds to it when it is called again."""
+    before, latest = read(folder, cell.file), Row()
     about = {"cell": cell.name, "machine": machine(), "at": time.strftime("%Y-%m-%d %H:%M:%S")}
     if jax.config.jax_compilation_cache_dir:
         # `compile_s` is then the time in which a compiled program is read.
         about["compiled_ahead"] = True
 
     def write(row: Row) -> None:
-        rows = [*before, about | row]
+        latest.update(row)
+        rows = [*before, about | latest]
         folder.mkdir(parents=True, exist_ok=True)
         part = folder / f"{cell.file}.part"
         part.write_text(json.dumps({"rows": rows}, indent=1) + "\n")
@@ -469,10 +493,19 @@ def append(folder: pathlib.Path, cell: Cell) -> Write:
     return write
 
 
+def has_figure(row: Row) -> bool:
+    """Whether a row says what was measured, even if the cell failed after that."""
+    if "judged" in row:
+        return bool(row["judged"])
+    return "steps_per_s" in row or not {"failed", "left_out"} & set(row)
+
+
 def in_order(folder: pathlib.Path, cells: list[Cell]) -> Iterator[Cell]:
     """The cells, those with the fewest figures first."""
     figures = {
-        cell.name: sum(row["cell"] == cell.name for row in read(folder, cell.file))
+        cell.name: sum(
+            row["cell"] == cell.name and has_figure(row) for row in read(folder, cell.file)
+        )
         for cell in cells
     }
     # Python's sort keeps the order of equal ones.
@@ -511,6 +544,9 @@ def main(arguments: list[str] | None = None) -> None:
     cells = list(in_order(options.json, cells))
     if options.ahead:
         compile_ahead(options.ahead, cells, visit)
+    ending = threading.Timer(60 * options.minutes + _GRACE_S, _end)
+    ending.daemon = True
+    ending.start()
     for cell in cells:
         # What is compiled takes a third of the time.
         if visit.left() < (cell.seconds / 3 if options.ahead else cell.seconds):
@@ -523,6 +559,13 @@ def main(arguments: list[str] | None = None) -> None:
             # One cell that does not fit the device must not cost the others.
             write({"failed": " ".join(str(error).split())[:300]})
         print(f"{cell.name}: {time.monotonic() - started:.0f} s", flush=True)
+    ending.cancel()
+
+
+def _end() -> None:
+    """Ends the command, whose results are on disk, in the middle of whatever takes too long."""
+    print("out of time: the last cell is not finished", flush=True)
+    os._exit(0)
 
 
 if __name__ == "__main__":

@@ -1,8 +1,7 @@
 """A search for options: short runs, of which Optuna ends the hopeless ones early.
 
 `python examples/sweep.py 20` makes 20 trials; without a number it makes 2. Started again, it
-continues. On the command line: `mjx-arm sweep --preset state --task reach --trials 20
---search learning-rate=1e-4..1e-2:log n-step=1..5`.
+continues. `mjx-arm sweep` does the same on the command line.
 """
 
 from __future__ import annotations

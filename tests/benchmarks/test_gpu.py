@@ -38,6 +38,30 @@ def test_cells_are_measured_once_before_any_is_measured_twice(tmp_path):
     assert list(gpu.in_order(tmp_path, cells)) == [*cells[2:], *cells[:2]]
 
 
+def test_a_cell_that_has_no_figure_yet_is_not_measured(tmp_path):
+    cells = {cell.name: cell for cell in gpu.CELLS[""]}
+    training, trained = cells["training and driving at 8192"], cells["a"]
+    gpu.append(tmp_path, training)({"failed": "no memory"})
+    gpu.append(tmp_path, trained)({"judged": []})
+    assert list(gpu.in_order(tmp_path, [trained, training])) == [trained, training]
+    # What failed after its figure has one.
+    write = gpu.append(tmp_path, trained)
+    write({"judged": [{"rate": 0.5}]})
+    write({"failed": "no memory"})
+    assert gpu.read(tmp_path, "train-a")[-1]["judged"] == [{"rate": 0.5}]
+    assert list(gpu.in_order(tmp_path, [trained, training])) == [training, trained]
+
+
+def test_a_command_ends_in_the_middle_of_what_takes_too_long(tmp_path):
+    program = f"""
+import time
+gpu._GRACE_S = 1
+gpu.CELLS[""] = [gpu.Cell("slow", "device", lambda visit, write: time.sleep(600), 0)]
+gpu.main(["--json", {str(tmp_path)!r}, "--minutes", "0.01"])
+"""
+    assert on_a_bare_machine(program) == "out of time: the last cell is not finished"
+
+
 def test_a_repeated_figure_is_appended_and_a_running_one_replaced(tmp_path):
     cell = gpu.CELLS[""][0]
     for value in (1, 2):
@@ -141,6 +165,20 @@ def test_a_row_has_as_many_samples_a_step_as_the_preset():
     config = set_train_options(preset, {"num_envs": 8_192, **options})
     assert config.samples_per_step == preset.samples_per_step == 4
     assert config.algo.student_batch_size == 2 * preset.algo.student_batch_size
+
+
+@pytest.mark.long
+def test_cells_are_measured_from_programs_that_were_compiled_ahead(tmp_path):
+    cells = ["physics+render at 8192", "training and driving at 8192", "ray cast fused"]
+    command = ["--json", str(tmp_path / "gpu"), "--tiny", "--minutes", "30", "--cells", *cells]
+    on_a_bare_machine(f"gpu.main({[*command, '--ahead', str(tmp_path / 'cache')]!r})")
+    rows = [
+        row for file in ("throughput", "comparisons") for row in gpu.read(tmp_path / "gpu", file)
+    ]
+    assert [row["cell"] for row in rows] == cells
+    assert all(row["compiled_ahead"] and row["steps_per_s"] > 0 for row in rows)
+    # Read, not compiled again.
+    assert max(row["compile_s"] for row in rows) < 10
 
 
 @pytest.mark.long

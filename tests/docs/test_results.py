@@ -130,7 +130,10 @@ def test_figures_of_a_gpu_that_are_missing_are_not_measured(tmp_path: pathlib.Pa
         "| environment A to 95 % | 3 minutes | not measured | not measured |",
         "| environment B to 90 % | 5 minutes | not measured | not measured |",
         "| physics and rendering of 8,192 environments | 400,000 steps/s | not measured |",
-        "| training of 8,192 environments | 100,000 steps/s | not measured |",
+        "| training of 8,192 environments, larger batches | 100,000 steps/s | not measured |",
+        "| memory of the training of 1,024 environments |  | not measured | not measured |",
+        "| comparison of 8,192: physics mjx-warp |  | not measured | not measured |",
+        "| training with Squint's published settings |  | not measured | not measured |",
     ):
         assert line in text
 
@@ -152,7 +155,18 @@ def test_figures_of_a_gpu_are_those_of_its_files(tmp_path: pathlib.Path):
     # The second run was stopped before; the third one failed.
     write("train-a", judged(0.5, 0.95, 0.97), judged(0.5, 0.9), {"failed": "no memory", **machine})
     rate = {"cell": "physics+render at 8192", "steps_per_s": 512_345, **machine}
-    write("throughput", rate, rate | {"cell": "training and driving at 8192", "steps_per_s": 1})
+    training = rate | {
+        "cell": "training and driving at 8192",
+        "steps_per_s": 421_260,
+        "samples_per_step": 2.0,
+        "planned_bytes": 2_816_193_048,
+        "peak_bytes": 3_100_000_000,
+    }
+    # It failed after it had a figure.
+    write("throughput", rate, training | {"failed": "no memory"})
+    write(
+        "comparisons", rate | {"cell": "physics mjx"}, {"cell": "physics mjx-warp", "left_out": 1}
+    )
     text = render("gpu", tmp_path)
     assert "| 3 minutes | 2.5 minutes, 90 % in 2.5 minutes | H100 |" in text
     assert "| environment B to 90 % | 5 minutes | not measured |" in text
@@ -160,8 +174,14 @@ def test_figures_of_a_gpu_are_those_of_its_files(tmp_path: pathlib.Path):
     assert "| images and a motion beside those of a CPU | equal | not measured |" in text
     # From the first evaluation to the last: 18 and 9 million steps in 2.5 and 1.25 minutes.
     assert "| 100,000 steps/s | 120,000 steps/s, 120,000 steps/s | H100 |" in text
+    assert (
+        "| training of 8,192 environments |  | 421,260 steps/s at 2 samples a step | H100 |" in text
+    )
+    assert "environments | 2.82 GB planned | 3.10 GB | H100 |" in text
     # That one trains on fewer samples for each step than the preset.
-    assert "| training of 8,192 environments | 100,000 steps/s | not measured |" in text
+    assert "larger batches | 100,000 steps/s | not measured |" in text
+    assert "| comparison of 8,192: physics mjx |  | 512,345 steps/s | H100 |" in text
+    assert "| comparison of 8,192: physics mjx-warp |  | not measured |" in text
 
 
 def test_a_gpu_is_compared_with_a_cpu(tmp_path: pathlib.Path):
