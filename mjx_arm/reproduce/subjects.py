@@ -57,7 +57,7 @@ class Subject:
 
 def way_of(config: TrainConfig) -> str | None:
     """How a configuration trains, one of `WAYS`; None where the page has no place for it."""
-    if config.env.task != "lift" or config.env.reward not in ("completion", "paper"):
+    if config.env.task != "lift" or config.env.reward not in ("completion", "shaped", "paper"):
         return None
     sees = "state" if config.env.observation == "state" else "pixels"
     base = "taught" if config.algorithm == "distill" else sees

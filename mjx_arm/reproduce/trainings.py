@@ -163,6 +163,7 @@ def agent_trainings(section: str, seeds: int = 1) -> list[Training]:
 # Name -> options that differ from the preset, and what the row says.
 REWARDS: dict[str, tuple[dict[str, object], str]] = {
     "completion": ({}, "`completion`, γ = 0.99: success is worth more than waiting"),
+    "shaped": ({"reward": "shaped"}, "`shaped`, γ = 0.99: `completion`, paid once it is earned"),
     "published": ({"reward": "paper"}, "published, γ = 0.99: hovering is worth more than success"),
     "published-98": (
         {"reward": "paper", "gamma": 0.98},

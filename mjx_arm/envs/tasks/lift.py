@@ -5,13 +5,14 @@ from __future__ import annotations
 import copy
 import functools
 from collections.abc import Mapping
-from typing import Literal
+from typing import Annotated, Literal
 
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 from jax.scipy.spatial.transform import Rotation
+from pydantic import Field
 
 from mjx_arm.envs.arm import Arm
 from mjx_arm.envs.collision import Obstacle
@@ -38,7 +39,10 @@ class LiftConfig(TaskConfig):
     `1 + height` while grasped, else `exp(-0.25 * distance)`. The reward `completion` keeps that
     shape, but bounds what a step without success can pay, so that finishing is worth more than
     holding the cube just below the goal: at discount 0.99 the paper's reward pays 130 for holding
-    it there for ever, and 100 for success.
+    it there for ever, and 100 for success. The reward `shaped` is `completion` with potential-based
+    shaping (Ng, Harada & Russell 1999): it also pays what a step adds to the potential, which is
+    what `completion` would pay for staying there for ever. The best policy is the same, but a step
+    pays at once what it is worth later. Only `completion` has Q-values like those of the paper.
 
     Attributes:
       lift: height that the cube must be lifted to, above its rest, m.
@@ -58,6 +62,8 @@ class LiftConfig(TaskConfig):
       completion_lift: most that is paid on top for the height, with its square root. In proportion
         to the height, the first step of a lift would change the Q-value by only 2 %, and would not
         be learnt.
+      shaping_discount: discount of the potential, reward `shaped`; that of the learner, or the best
+        policy may be another.
     """
 
     lift: Positive = 0.3
@@ -72,6 +78,7 @@ class LiftConfig(TaskConfig):
     completion_reach: float = 0.2
     completion_grasp: float = 0.25
     completion_lift: float = 0.5
+    shaping_discount: Annotated[float, Field(ge=0, lt=1)] = 0.99
 
     def check(self) -> None:
         """Rejects a share of starts in the grasp where all of them are."""
@@ -116,6 +123,7 @@ class Lift:
         self.rewards: Mapping[str, Reward] = {
             "paper": functools.partial(paper_reward, config, self.cube_geom),
             "completion": functools.partial(completion_reward, config),
+            "shaped": functools.partial(shaped_reward, config),
         }
         self.feature_scales = (*[5.0] * 3, *[1.0] * 4, *[10.0] * 3)
 
@@ -273,6 +281,22 @@ def completion_reward(
         grasp=jnp.full_like(height, config.completion_grasp),
         lift=config.completion_lift * jnp.sqrt(share),
     )
+
+
+def shaped_reward(
+    config: LiftConfig, before: Snapshot, after: Snapshot, action: jax.Array
+) -> dict[str, jax.Array]:
+    """The reward `completion` with potential-based shaping; see `LiftConfig`.
+
+    With the discount g, the potential `completion / (1 - g)`, and the rewards r after the step and
+    r' before it, this is r + g r / (1 - g) - r' / (1 - g) = (r - r') / (1 - g). After a success
+    there is no potential.
+    """
+    was = completion_reward(config, before, before, action)
+    now = completion_reward(config, before, after, action)
+    horizon = np.float32(1.0 / (1.0 - config.shaping_discount))
+    gains = {name: horizon * (now[name] - was[name]) for name in now}
+    return gains | {"success": now["success"]}
 
 
 def _terms(

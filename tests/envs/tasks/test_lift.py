@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import itertools
 import pathlib
 
 import jax
@@ -13,7 +14,14 @@ import mjx_arm
 from mjx_arm.envs.arm import resolve_arm
 from mjx_arm.envs.scripted import make_scripted_policy
 from mjx_arm.envs.state import Snapshot
-from mjx_arm.envs.tasks.lift import Lift, LiftConfig, completion_reward, grasped, paper_terms
+from mjx_arm.envs.tasks.lift import (
+    Lift,
+    LiftConfig,
+    completion_reward,
+    grasped,
+    paper_terms,
+    shaped_reward,
+)
 from mjx_arm.kinematics import make_kinematics
 
 GAMMA = 0.99
@@ -25,6 +33,7 @@ LEAST_RECALL = 0.98
 REWARDS = {
     "paper": lambda config, _, after, action: paper_terms(config, after, after.measured["height"]),
     "completion": completion_reward,
+    "shaped": shaped_reward,
 }
 SCENE = pathlib.Path(__file__).parents[3] / "xml" / "arm_cube.xml"
 
@@ -95,6 +104,36 @@ def test_only_the_papers_reward_prefers_to_hover(kind, hovering_wins):
     hovering = total(kind, grasped=True, height=0.2999) / (1 - GAMMA)
     success = total(kind, grasped=True, height=LIFT, success=True)
     assert (hovering > success) == hovering_wins
+
+
+def test_shaping_changes_the_return_of_an_episode_by_the_potential_of_its_start():
+    """So the best policy stays the same."""
+    config = LiftConfig(shaping_discount=GAMMA)
+    way = [
+        snapshot(distance=0.3),
+        snapshot(distance=0.1),
+        # It is grasped, lost and grasped again.
+        snapshot(distance=0.0, grasped=True, height=0.1),
+        snapshot(distance=0.05, height=0.1),
+        snapshot(distance=0.0, grasped=True, height=0.2),
+        snapshot(distance=0.0, grasped=True, height=0.3, success=True),
+    ]
+
+    def total_of(kind: str, before: Snapshot, after: Snapshot) -> float:
+        return float(sum(REWARDS[kind](config, before, after, jnp.int32(0)).values()))
+
+    returns = {
+        kind: sum(
+            GAMMA**t * total_of(kind, *pair) for t, pair in enumerate(itertools.pairwise(way))
+        )
+        for kind in ("completion", "shaped")
+    }
+    start = total_of("completion", way[0], way[0]) / (1 - GAMMA)
+    assert returns["shaped"] == pytest.approx(returns["completion"] - start, rel=1e-5)
+    # To stay pays nothing, to come nearer pays at once, and to lose the cube costs as much.
+    gains = [total_of("shaped", *pair) for pair in itertools.pairwise([way[0], *way])]
+    assert gains[0] == 0
+    assert [gain > 0 for gain in gains[1:]] == [True, True, False, True, True]
 
 
 def test_completion_grows_on_the_way():
