@@ -57,9 +57,11 @@ class Panel:
         self._reward_scale = 1e-6
         self._status = self._gui.add_markdown("starting")
         self._training = self._gui.add_markdown("", visible=False)
+        self._agents: Any = None
         if choices:
-            agent = self._gui.add_dropdown("agent", list(choices), initial_value=chosen)
-            agent.on_update(lambda _: send("choose", agent.value))
+            agents = self._gui.add_dropdown("agent", list(choices), initial_value=chosen)
+            agents.on_update(lambda _: send("choose", agents.value))
+            self._agents = agents
         self._pause = self._gui.add_button("Pause")
         self._pause.on_click(lambda _: send("pause", None))
         self._group("episode", {"step": ("step", None), "next seed": ("restart", None)})
@@ -90,6 +92,10 @@ class Panel:
         actors = ACTORS if session.simulation.has_agent else ACTORS[1:]
         actor = gui.add_dropdown("who acts", list(actors), initial_value=session.actor)
         actor.on_update(lambda _: send("actor", actor.value))
+
+    def offer(self, choices: Sequence[str]) -> None:
+        """Changes the agents to choose from; the one that is shown stays chosen."""
+        self._agents.options = tuple(choices)
 
     def _changed(self, name: str, value: Callable[[], Any]) -> Callable[[Any], None]:
         """Sends what a visitor changed, not what the program itself set."""

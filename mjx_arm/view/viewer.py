@@ -258,6 +258,7 @@ class Viewer:
         if choice is None or agent is None:
             return
         self._training = training_line(choice)
+        self._offer_new()
         version = choice.version
         if version in (0, self._version):
             return
@@ -272,6 +273,14 @@ class Viewer:
             return
         params, self._env_steps = found
         self.session.set_params(params)
+
+    def _offer_new(self) -> None:
+        """Offers an agent that the training has saved for the first time, such as its best one."""
+        choices = find_choices(self._options.subject)
+        # A file is away for a moment while it is written again.
+        if {choice.name for choice in choices} > {choice.name for choice in self._choices}:
+            self._choices = choices
+            self._panel.offer([choice.name for choice in choices])
 
     def _load(self, choice: Choice, seed: int) -> Session:
         version = choice.version

@@ -59,10 +59,9 @@ def save_again(path: pathlib.Path, env_steps: int, scale: float) -> None:
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory) -> pathlib.Path:
-    """A run that still trains: metrics, the best agent and the last one."""
+    """A run that still trains: metrics and the last agent; none is the best one yet."""
     folder = tmp_path_factory.mktemp("runs") / "live"
     make_run(folder, env="B")
-    save_again(folder / "best.safetensors", 500, 1.0)
     save_again(folder / "last.safetensors", 1_000, 0.9)
     return folder
 
@@ -243,8 +242,11 @@ def test_another_seed_is_another_episode(page, viewer):
 
 
 @pytest.mark.slow
-def test_the_best_and_the_last_agent_of_a_run_change_places(page, viewer):
+def test_the_best_and_the_last_agent_of_a_run_change_places(page, viewer, run):
     pause(page)
+    # The training selects its first agent while a visitor looks.
+    save_again(run / "best.safetensors", 500, 1.0)
+    wait_until(lambda: "best" in [choice.name for choice in viewer._choices], page)
     seed, seen = viewer.session.seed, {}
     for name, steps in (("last", "1,000"), ("best", "500"), ("last", "1,000")):
         choose(page, name)
