@@ -56,7 +56,11 @@ class PatchConv(nn.Module):
 
 
 class Head(nn.Module):
-    """Hidden dense layers and an output; with `dueling` a value and an advantage stream."""
+    """Hidden dense layers and an output; with `dueling` a value and an advantage stream.
+
+    At first all Q-values are 0: what actions differ by is far less than random outputs, and these
+    would have to be unlearnt first.
+    """
 
     hidden: int
     num_actions: int
@@ -70,10 +74,11 @@ class Head(nn.Module):
         for _ in range(self.layers):
             x = nn.Dense(self.hidden, kernel_init=nn.initializers.he_normal())(x)
             x = nn.relu(nn.LayerNorm()(x) if self.layer_norm else x)
-        advantage = nn.Dense(self.num_actions)(x)
+        zeros = nn.initializers.zeros_init()
+        advantage = nn.Dense(self.num_actions, kernel_init=zeros)(x)
         if not self.dueling:
             return advantage
-        value = nn.Dense(1)(x)
+        value = nn.Dense(1, kernel_init=zeros)(x)
         return value + advantage - jnp.mean(advantage, axis=-1, keepdims=True)
 
 
