@@ -38,6 +38,11 @@ def measure_reward(name: str, run: pathlib.Path, trial: Trial) -> Result:
         hovering = 1 + (options.lift + task.half_size) / options.height_unit
     else:
         hovering = options.completion_grasp + options.completion_lift
+    success = options.success_reward
+    if config.env.reward == "shaped":
+        # Hovering has been paid for when the cube came there, and success takes that back.
+        success -= hovering / (1 - options.shaping_discount)
+        hovering = 0.0
     result |= {
         "reward": config.env.reward,
         "gamma": config.algo.gamma,
@@ -46,7 +51,7 @@ def measure_reward(name: str, run: pathlib.Path, trial: Trial) -> Result:
         "worth": {
             "a_step_of_hovering": hovering,
             "hovering_for_ever": hovering / (1 - config.algo.gamma),
-            "success": options.success_reward,
+            "success": success,
         },
         "curve": read_curve(run, config.env.reward_scale),
     }

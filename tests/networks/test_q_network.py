@@ -89,6 +89,9 @@ def test_several_cameras_are_channels():
     packed = jax.random.bits(jax.random.key(0), (2, 3, 32, 32), jnp.uint32)
     params = network.init(jax.random.key(1), packed)
     assert params["params"]["PatchConv_0"]["kernel"].shape == (5, 5, 9, 4)
+    # At first all Q-values are 0.
+    assert not np.asarray(network.apply(params, packed)).any()
+    params = jax.tree.map(lambda x: x + 0.1, params)
     q = network.apply(params, packed)
     assert q.shape == (2, 14)
     # Which camera shows an image matters.

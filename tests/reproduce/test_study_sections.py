@@ -96,7 +96,8 @@ def test_the_reward_is_worth_what_the_calculation_says(tmp_path, run):
     # What is not there is named.
     assert "Not measured yet: `reward-completion-seed0`" in text
     assert (
-        "--only reward-completion-seed0 reward-completion-seed1 reward-published-98-seed1" in text
+        "--only reward-completion-seed0 reward-completion-seed1 reward-shaped-seed0 "
+        "reward-shaped-seed1 reward-published-98-seed1" in text
     )
 
 

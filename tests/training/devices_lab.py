@@ -86,6 +86,15 @@ def gap(one, other) -> float:
     return max(float(np.abs(np.asarray(a) - np.asarray(b)).max()) for a, b in pairs)
 
 
+def relative_gap(one, other) -> float:
+    """The largest difference of two trees, of numbers above 1 in units of themselves."""
+    pairs = zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True)
+    return max(
+        float((np.abs(np.asarray(a) - b) / np.maximum(1.0, np.abs(np.asarray(a)))).max())
+        for a, b in pairs
+    )
+
+
 def copies_agree(tree) -> bool:
     """Whether each device has the same copy of every array of a tree."""
     return all(
@@ -207,6 +216,19 @@ def exchange() -> dict:
     }
 
 
+def stirred(tree):
+    """A new learner whose Q-values differ: those of a new network are 0, and the imitation of equal
+    ones enlarges rounding."""
+    return jax.tree.map(
+        lambda x: (
+            x + 0.1 * jnp.cos(jnp.arange(x.size, dtype=x.dtype)).reshape(x.shape)
+            if jnp.issubdtype(x.dtype, jnp.floating)
+            else x
+        ),
+        tree,
+    )
+
+
 class Apart(Shard):
     """Averages nothing, so that each device shows what it has learnt by itself."""
 
@@ -311,8 +333,8 @@ def updates() -> dict:
         pair = Plain(DistillConfig(student_polyak=0.1), FRAMES, learning, network, 4)
 
         def learn(batch, obs, next_obs, learning=learning, pair=pair):
-            learner = learning.init(keys[4], obs[0])
-            student = pair.init(keys[5], obs[0], {"features": obs[0]}).student
+            learner = stirred(learning.init(keys[4], obs[0]))
+            student = stirred(pair.init(keys[5], obs[0], {"features": obs[0]}).student)
 
             def once(carry, row):
                 learner, student = carry
@@ -329,8 +351,8 @@ def updates() -> dict:
         run = jax.jit(sharded(learn, mesh, (spec, spec, spec), P()))
         parameters[devices] = jax.device_get(run(batch, obs, next_obs))
     return {
-        "gaps": [gap(parameters[1], parameters[devices]) for devices in (2, 4)],
-        "learnt": gap(parameters[1][0], learning.init(keys[4], obs[0]).params),
+        "gaps": [relative_gap(parameters[1], parameters[devices]) for devices in (2, 4)],
+        "learnt": gap(parameters[1][0], stirred(learning.init(keys[4], obs[0])).params),
     }
 
 
