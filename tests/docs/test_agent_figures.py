@@ -8,6 +8,11 @@ import re
 
 import pytest
 
+from mjx_arm.cli.parse import parse
+from mjx_arm.config import set_train_options
+from mjx_arm.options import flat_names, get_option
+from mjx_arm.training.run_folder import load_config
+
 ROOT = pathlib.Path(__file__).parents[2]
 RESULTS = sorted((ROOT / "benchmarks" / "results").glob("agent-*/in_?.json"))
 
@@ -37,3 +42,19 @@ def test_every_shipped_agent_was_tried_in_both_environments():
     assert {(path.parent.name, path.stem) for path in RESULTS} == {
         (name, f"in_{env}") for name in names for env in "AB"
     }
+
+
+@pytest.mark.parametrize("env", ["a", "b"])
+def test_the_command_of_a_card_trains_with_the_options_of_its_agent(env):
+    card = (ROOT / "mjx_arm" / "agents" / f"agent-{env}.md").read_text()
+    command = re.search(r"^\| command \| `mjx-arm (.*)` \|$", card, re.MULTILINE)[1]
+    options = parse(command.split())[0].options
+    config = load_config(ROOT / "benchmarks" / "results" / f"agent-{env}")
+    # The run names the backend that `auto` meant.
+    options = set_train_options(options, {"physics": config.env.physics})
+    different = {
+        name: (get_option(options, name), get_option(config, name))
+        for name in flat_names(config)
+        if get_option(options, name) != get_option(config, name)
+    }
+    assert different == {}
