@@ -3,14 +3,14 @@
     python benchmarks/gpu.py --json DIR                     # the cells of one visit, in their order
     python benchmarks/gpu.py --json DIR --only b            # then environment B, 8 minutes
     python benchmarks/gpu.py --json DIR --only published    # then settings that others published
-    python benchmarks/gpu.py --json DIR --ahead CACHE       # the same, in less time on many cores
+    python benchmarks/gpu.py --json DIR --ahead CACHE       # the same, compiled in parallel first
     JAX_PLATFORMS=cpu python benchmarks/gpu.py --store      # the CPU's values that parity needs
 
 A cell is one figure. Cells with fewer figures come first, so that none is measured twice before
 each is measured once; a repeated command appends. It needs neither a network nor orbax,
 imageio-ffmpeg, tensorboardX, gymnasium and matplotlib; `wheels.py` fetches the rest. `--ahead`
-first compiles the programs of all cells at the same time, on as many cores as there are: a minute
-for each, one after another, is most of a visit. `--tiny` rehearses it on a CPU.
+first compiles the programs of all cells in parallel: one after another they take about a minute
+each. `--tiny` rehearses it on a CPU.
 """
 
 from __future__ import annotations
@@ -328,7 +328,7 @@ def training(
             return
         figures = time_training(compiled, 1 if visit.tiny else 3)
     write({"num_envs": config.num_envs, "options": options, **figures})
-    if not (options or visit.tiny):
+    if not options:
         # The device never forgets a peak, so another process looks at it, and takes what it needs.
         with _environment(XLA_PYTHON_CLIENT_PREALLOCATE="false"):
             write(peak_memory_apart(config))
@@ -544,7 +544,7 @@ def main(arguments: list[str] | None = None) -> None:
     cells = list(in_order(options.json, cells))
     if options.ahead:
         compile_ahead(options.ahead, cells, visit)
-    ending = threading.Timer(60 * options.minutes + _GRACE_S, _end)
+    ending = threading.Timer(visit.left() + _GRACE_S, _end)
     ending.daemon = True
     ending.start()
     for cell in cells:

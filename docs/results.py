@@ -275,7 +275,7 @@ def _rate(content: Any, cell: str, what: str, file: str = "throughput") -> list[
     said = []
     for row in rows:
         samples = row.get("samples_per_step")
-        per_step = "" if samples is None else f" at {samples:g} samples a step"
+        per_step = "" if samples is None else f" with {samples:g} samples for each step"
         said.append(f"{_number(row['steps_per_s'])} steps/s{per_step}")
     return [what, "", *_cells_of(said, rows)]
 

@@ -58,8 +58,8 @@ class PatchConv(nn.Module):
 class Head(nn.Module):
     """Hidden dense layers and an output; with `dueling` a value and an advantage stream.
 
-    At first all Q-values are 0: what actions differ by is far less than random outputs, and these
-    would have to be unlearnt first.
+    At first all Q-values are 0. Random ones would differ between actions by far more than the true
+    ones do, and would have to be unlearnt.
     """
 
     hidden: int

@@ -105,8 +105,9 @@ def make_evaluator(
             compiled.append(advance.lower(params, run).compile())
             # Processes do not compile equally long, and one that computes does not wait for long.
             wait_for_all()
+        step = compiled[0] if compiled else advance
         while left > 0:
-            run, most = (compiled or [advance])[0](params, run)
+            run, most = step(params, run)
             left = int(most)
         return _summarise(fetch(run.counts), episodes)
 

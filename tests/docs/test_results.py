@@ -175,7 +175,8 @@ def test_figures_of_a_gpu_are_those_of_its_files(tmp_path: pathlib.Path):
     # From the first evaluation to the last: 18 and 9 million steps in 2.5 and 1.25 minutes.
     assert "| 100,000 steps/s | 120,000 steps/s, 120,000 steps/s | H100 |" in text
     assert (
-        "| training of 8,192 environments |  | 421,260 steps/s at 2 samples a step | H100 |" in text
+        "training of 8,192 environments |  | 421,260 steps/s with 2 samples for each step | H100 |"
+        in text
     )
     assert "environments | 2.82 GB planned | 3.10 GB | H100 |" in text
     # That one trains on fewer samples for each step than the preset.

@@ -86,15 +86,6 @@ def gap(one, other) -> float:
     return max(float(np.abs(np.asarray(a) - np.asarray(b)).max()) for a, b in pairs)
 
 
-def relative_gap(one, other) -> float:
-    """The largest difference of two trees, of numbers above 1 in units of themselves."""
-    pairs = zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True)
-    return max(
-        float((np.abs(np.asarray(a) - b) / np.maximum(1.0, np.abs(np.asarray(a)))).max())
-        for a, b in pairs
-    )
-
-
 def copies_agree(tree) -> bool:
     """Whether each device has the same copy of every array of a tree."""
     return all(
@@ -217,16 +208,18 @@ def exchange() -> dict:
 
 
 def stirred(tree):
-    """A new learner whose Q-values differ: those of a new network are 0, and the imitation of equal
-    ones enlarges rounding."""
-    return jax.tree.map(
-        lambda x: (
-            x + 0.1 * jnp.cos(jnp.arange(x.size, dtype=x.dtype)).reshape(x.shape)
-            if jnp.issubdtype(x.dtype, jnp.floating)
-            else x
-        ),
-        tree,
-    )
+    """A new learner whose Q-values differ.
+
+    Those of a new network are 0, and the imitation of equal ones enlarges rounding.
+    """
+
+    def fill(x):
+        if x.ndim != 2 or not jnp.issubdtype(x.dtype, jnp.floating):
+            return x
+        wave = jnp.cos(jnp.arange(x.size, dtype=x.dtype)).reshape(x.shape) / np.sqrt(len(x))
+        return jnp.where(jnp.any(x != 0), x, wave.astype(x.dtype))
+
+    return jax.tree.map(fill, tree)
 
 
 class Apart(Shard):
@@ -351,7 +344,7 @@ def updates() -> dict:
         run = jax.jit(sharded(learn, mesh, (spec, spec, spec), P()))
         parameters[devices] = jax.device_get(run(batch, obs, next_obs))
     return {
-        "gaps": [relative_gap(parameters[1], parameters[devices]) for devices in (2, 4)],
+        "gaps": [gap(parameters[1], parameters[devices]) for devices in (2, 4)],
         "learnt": gap(parameters[1][0], stirred(learning.init(keys[4], obs[0])).params),
     }
 

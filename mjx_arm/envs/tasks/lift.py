@@ -42,7 +42,7 @@ class LiftConfig(TaskConfig):
     it there for ever, and 100 for success. The reward `shaped` is `completion` with potential-based
     shaping (Ng, Harada & Russell 1999): it also pays what a step adds to the potential, which is
     what `completion` would pay for staying there for ever. The best policy is the same, but a step
-    pays at once what it is worth later. Only `completion` has Q-values like those of the paper.
+    pays at once what it is worth later. The Q-values are lower by the potential.
 
     Attributes:
       lift: height that the cube must be lifted to, above its rest, m.
@@ -62,8 +62,8 @@ class LiftConfig(TaskConfig):
       completion_lift: most that is paid on top for the height, with its square root. In proportion
         to the height, the first step of a lift would change the Q-value by only 2 %, and would not
         be learnt.
-      shaping_discount: discount of the potential, reward `shaped`; that of the learner, or the best
-        policy may be another.
+      shaping_discount: discount of the potential, reward `shaped`. Give the learner's `gamma`: with
+        another one the best policy may differ.
     """
 
     lift: Positive = 0.3
@@ -286,7 +286,7 @@ def completion_reward(
 def shaped_reward(
     config: LiftConfig, before: Snapshot, after: Snapshot, action: jax.Array
 ) -> dict[str, jax.Array]:
-    """The reward `completion` with potential-based shaping; see `LiftConfig`.
+    """The terms of `completion` with potential-based shaping, each `[] float32`; see `LiftConfig`.
 
     With the discount g, the potential `completion / (1 - g)`, and the rewards r after the step and
     r' before it, this is r + g r / (1 - g) - r' / (1 - g) = (r - r') / (1 - g). After a success
