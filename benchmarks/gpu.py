@@ -3,14 +3,14 @@
     python benchmarks/gpu.py --json DIR                     # the cells of one visit, in their order
     python benchmarks/gpu.py --json DIR --only b            # then environment B, 8 minutes
     python benchmarks/gpu.py --json DIR --only published    # then settings that others published
-    python benchmarks/gpu.py --json DIR --ahead CACHE       # the same, compiled in parallel first
+    python benchmarks/gpu.py --json DIR --ahead             # the same, compiled in parallel first
     JAX_PLATFORMS=cpu python benchmarks/gpu.py --store      # the CPU's values that parity needs
 
 A cell is one figure. Cells with fewer figures come first, so that none is measured twice before
 each is measured once; a repeated command appends. It needs neither a network nor orbax,
-imageio-ffmpeg, tensorboardX, gymnasium and matplotlib; `wheels.py` fetches the rest. `--ahead`
-first compiles the programs of all cells in parallel: one after another they take about a minute
-each. `--tiny` rehearses it on a CPU.
+imageio-ffmpeg, tensorboardX, gymnasium and matplotlib; `wheels.py` fetches the rest. With `--ahead`
+each cell has a process of its own: all compile in parallel, for it takes about a minute each, then
+they measure one after another. `--tiny` rehearses it on a CPU.
 """
 
 from __future__ import annotations
@@ -26,7 +26,6 @@ import os
 import pathlib
 import subprocess
 import sys
-import tempfile
 import threading
 import time
 import zlib
@@ -39,8 +38,8 @@ from machine import machine
 from throughput import (
     compile_training,
     env_stages,
-    peak_memory_apart,
-    time_stage,
+    peak_memory,
+    time_chunks,
     time_training,
 )
 
@@ -85,12 +84,12 @@ class Visit:
     Attributes:
       tiny: whether this is a rehearsal at sizes that mean nothing.
       deadline: when the command must be done, by `time.monotonic`.
-      compiles: whether programs are compiled alone, and nothing is measured.
+      ready: called once everything is compiled; returns when it may be measured.
     """
 
     tiny: bool
     deadline: float
-    compiles: bool = False
+    ready: Callable[[], None] = lambda: None
 
     def left(self) -> float:
         """Seconds that are left."""
@@ -114,19 +113,17 @@ class Cell:
       file: the name of its file, without its ending.
       measure: takes the visit, and a function that writes what is known so far.
       seconds: the least time that it needs; with less it is not begun.
-      again: whether an earlier cell has the same programs, which are compiled ahead once.
     """
 
     name: str
     file: str
     measure: Callable[[Visit, Write], None]
     seconds: float
-    again: bool = False
 
 
 def device(visit: Visit, write: Write) -> None:
     """Versions and device."""
-    del visit
+    visit.ready()
     one = jax.devices()[0]
     query = ["nvidia-smi", "--query-gpu=driver_version", "--format=csv,noheader"]
     # Never a tag, which would not name the commit.
@@ -153,7 +150,7 @@ def first_line(command: list[str]) -> str | None:
 
 def parity(visit: Visit, write: Write) -> None:
     """Renderer and physics here beside the stored values of the CPU."""
-    del visit
+    visit.ready()
     write(compare(json.loads(STORED.read_text()), compute()))
 
 
@@ -231,8 +228,7 @@ def train(visit: Visit, write: Write, *, env: str, goal: float, minutes: float) 
     key = role_key(_SEED, SELECTION)
     # The first of both is no part of the training: compiled and thrown away.
     judge(trainer.algorithm.policy(state.learner), key)
-    if visit.compiles:
-        return
+    visit.ready()
     row: Row = {
         "env": env,
         "goal": goal,
@@ -299,11 +295,13 @@ def environment(
     if fence:
         env = _Fenced(**{field.name: getattr(env, field.name) for field in dataclasses.fields(env)})
     run = env_stages(env, num_envs, length)[stage]
-    if visit.compiles:
-        jax.jit(run, compiler_options=flags).lower((state, obs)).compile()
-        return
-    figures = time_stage(run, (state, obs), num_envs * length, 3, flags)
-    write({"num_envs": num_envs, "size": size, "backend": env.physics.backend, **figures})
+    started = time.perf_counter()
+    compiled = jax.jit(run, compiler_options=flags).lower((state, obs)).compile()
+    compile_s = round(time.perf_counter() - started, 2)
+    visit.ready()
+    figures = time_chunks(lambda: compiled((state, obs)), num_envs * length, 3)
+    about = {"num_envs": num_envs, "size": size, "backend": env.physics.backend}
+    write({**about, **figures, "compile_s": compile_s})
 
 
 class _Fenced(mjx_arm.Env):
@@ -324,26 +322,11 @@ def training(
     config = set_train_options(config, {"chunk_steps": _length(config, visit) * config.num_envs})
     with jax.default_matmul_precision(precision) if precision else contextlib.nullcontext():
         compiled = compile_training(config)
-        if visit.compiles:
-            return
+        visit.ready()
         figures = time_training(compiled, 1 if visit.tiny else 3)
     write({"num_envs": config.num_envs, "options": options, **figures})
     if not options:
-        # The device never forgets a peak, so another process looks at it, and takes what it needs.
-        with _environment(XLA_PYTHON_CLIENT_PREALLOCATE="false"):
-            write(peak_memory_apart(config))
-
-
-@contextlib.contextmanager
-def _environment(**variables: str) -> Iterator[None]:
-    """Variables of the environment for the processes that are started within it."""
-    before = dict(os.environ)
-    os.environ.update(variables)
-    try:
-        yield
-    finally:
-        os.environ.clear()
-        os.environ.update(before)
+        write(peak_memory(compiled))
 
 
 def _with_own_ratio(num_envs: int) -> dict[str, int]:
@@ -383,17 +366,15 @@ def _cells() -> dict[str, list[Cell]]:
             measure = part(training, num_envs=many, **_with_own_ratio(many))
             name = f"training and driving at {many} with the preset's samples a step"
             first.append(Cell(name, "throughput", measure, 90))
-    for convolution in ("nn.Conv", "patches"):
-        measure = part(training, num_envs=many, convolution=convolution)
-        again = convolution == "nn.Conv"
-        first.append(Cell(f"convolution {convolution}", "comparisons", measure, 90, again))
-    for precision in ("highest", "default"):
-        measure = part(training, num_envs=many, precision=precision)
-        again = precision == "default"
-        first.append(Cell(f"precision {precision}", "comparisons", measure, 90, again))
-    for name, fence in (("fused", False), ("fenced", True)):
-        measure = part(environment, num_envs=many, fence=fence)
-        first.append(Cell(f"ray cast {name}", "comparisons", measure, 60, again=not fence))
+    # Each beside the cell above that differs in this alone.
+    patches = part(training, num_envs=many, convolution="patches")
+    highest = part(training, num_envs=many, precision="highest")
+    fenced = part(environment, num_envs=many, fence=True)
+    first += [
+        Cell("convolution patches", "comparisons", patches, 90),
+        Cell("precision highest", "comparisons", highest, 90),
+        Cell("ray cast fenced", "comparisons", fenced, 60),
+    ]
     for physics in ("mjx", "mjx-warp"):
         measure = part(environment, num_envs=many, stage="physics", physics=physics)
         first.append(Cell(f"physics {physics}", "comparisons", measure, 60))
@@ -410,8 +391,8 @@ def _cells() -> dict[str, list[Cell]]:
         "learning_starts": 0,
     }
     published = [
-        # Playground's PandaPickCubeCartesian: 1,024 environments of 64 by 64 pixels.
-        Cell("playground", "published", part(environment, num_envs=1_024), 60, again=True),
+        # Playground's PandaPickCubeCartesian has 1,024 environments of 64 by 64 pixels, like a cell
+        # of the first command; its physics alone is this one.
         Cell(
             "playground, physics",
             "published",
@@ -426,46 +407,87 @@ def _cells() -> dict[str, list[Cell]]:
 
 CELLS = _cells()
 # A program's kernels are tried on the GPU before most of the compiling, which needs cores alone: so
-# long the next one waits, that none is tried beside another's.
-_APART_S = 10
+# long the next one waits, that few are tried beside another's.
+_APART_S = 6
+# What a process prints when it only waits for its turn.
+_READY = "compiled"
 # So long a cell may go on after the minutes of a command, which with the default ends before 9.
 _GRACE_S = 20
 
 
-def compile_ahead(cache: pathlib.Path, cells: list[Cell], visit: Visit) -> None:
-    """Compiles the programs of all cells, each in a process of its own, into jax's cache.
+def measure_ahead(folder: pathlib.Path, cells: list[Cell], visit: Visit) -> None:
+    """Compiles the programs of all cells in parallel; then measures one cell after another.
 
     Args:
-      cache: folder of the cache, for this and later processes.
-      cells: whose programs are compiled.
-      visit: when it must be over; what is not compiled by then is compiled by its cell.
+      folder: for the results.
+      cells: each gets a process of its own.
+      visit: two thirds of its time may pass until a program is compiled, or its cell is left out.
     """
-    options = {
-        "jax_compilation_cache_dir": str(cache.resolve()),
-        "jax_persistent_cache_min_compile_time_secs": 0,
-        "jax_persistent_cache_min_entry_size_bytes": -1,
-    }
-    for name, value in options.items():
-        jax.config.update(name, value)
-    # Also for the processes that cells start.
-    os.environ.update({name.upper(): str(value) for name, value in options.items()})
     # Each takes the memory that it needs, not most of it.
     environment = os.environ | {"XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
-    own = [cell for cell in cells if not cell.again]
-    with tempfile.TemporaryDirectory() as nowhere:
-        command = [sys.executable, __file__, "--json", nowhere, "--compile-only"]
-        command += ["--tiny"] * visit.tiny
-        begun = []
-        for cell in own:
-            begun.append(subprocess.Popen([*command, "--cells", cell.name], env=environment))
-            time.sleep(0 if visit.tiny else _APART_S)
-        for cell, process in zip(own, begun, strict=True):
-            try:
-                if process.wait(max(visit.left(), 1)) != 0:
-                    print(f"{cell.name}: not compiled ahead", flush=True)
-            except subprocess.TimeoutExpired:
+    compiled_by = visit.deadline - visit.left() / 3
+    command = [sys.executable, __file__, "--json", str(folder), *["--tiny"] * visit.tiny]
+    begun = []
+    for cell in cells:
+        minutes = str(max(visit.left(), 0) / 60)
+        begun.append(
+            subprocess.Popen(
+                [*command, "--wait", "--minutes", minutes, "--cells", cell.name],
+                env=environment,
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                text=True,
+            )
+        )
+        time.sleep(0 if visit.tiny else _APART_S)
+    with contextlib.ExitStack() as stack:
+        for process in begun:
+            stack.enter_context(process)
+            stack.callback(process.kill)
+        ready = [said(process, _READY, compiled_by - time.monotonic()) for process in begun]
+        # What still compiles would disturb what is measured.
+        for process, is_ready in zip(begun, ready, strict=True):
+            if not is_ready:
                 process.kill()
-                process.wait()
+        for cell, process, is_ready in zip(cells, begun, ready, strict=True):
+            started = time.monotonic()
+            if not is_ready:
+                print(f"{cell.name}: not compiled in time, or it failed", flush=True)
+                continue
+            if visit.left() < cell.seconds / 3:
+                print(f"{cell.name}: left out, {visit.left():.0f} s are left", flush=True)
+                continue
+            process.stdin.write("go\n")
+            process.stdin.flush()
+            try:
+                process.wait(visit.left() + _GRACE_S)
+            except subprocess.TimeoutExpired:
+                print(f"{cell.name}: not measured in time", flush=True)
+                continue
+            print(f"{cell.name}: {time.monotonic() - started:.0f} s", flush=True)
+
+
+def said(process: subprocess.Popen[str], line: str, seconds: float) -> bool:
+    """Whether a process prints this line before the seconds are over and before it ends."""
+    found = threading.Event()
+    done = threading.Event()
+
+    def listen() -> None:
+        for printed in process.stdout or ():
+            if printed.rstrip() == line:
+                found.set()
+                break
+        done.set()
+
+    threading.Thread(target=listen, daemon=True).start()
+    done.wait(max(seconds, 0))
+    return found.is_set()
+
+
+def wait_for_turn() -> None:
+    """Says that everything is compiled and waits until it is this process's turn."""
+    print(_READY, flush=True)
+    sys.stdin.readline()
 
 
 def read(folder: pathlib.Path, file: str) -> list[Row]:
@@ -474,15 +496,20 @@ def read(folder: pathlib.Path, file: str) -> list[Row]:
     return json.loads(path.read_text())["rows"] if path.is_file() else []
 
 
-def append(folder: pathlib.Path, cell: Cell) -> Write:
+def append(folder: pathlib.Path, cell: Cell, *, ahead: bool = False) -> Write:
     """A function that writes a new row of a cell, and adds to it when it is called again."""
-    before, latest = read(folder, cell.file), Row()
-    about = {"cell": cell.name, "machine": machine(), "at": time.strftime("%Y-%m-%d %H:%M:%S")}
-    if jax.config.jax_compilation_cache_dir:
-        # `compile_s` is then the time in which a compiled program is read.
-        about["compiled_ahead"] = True
+    before: list[Row] = []
+    about, latest = Row(), Row()
 
     def write(row: Row) -> None:
+        if not about:
+            # Not earlier: with `--ahead` other processes write while this one waits.
+            before.extend(read(folder, cell.file))
+            now = time.strftime("%Y-%m-%d %H:%M:%S")
+            about.update({"cell": cell.name, "machine": machine(), "at": now})
+            if ahead:
+                # `compile_s` is then a time beside others that compile.
+                about["compiled_ahead"] = True
         latest.update(row)
         rows = [*before, about | latest]
         folder.mkdir(parents=True, exist_ok=True)
@@ -520,11 +547,13 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--cells", nargs="+", help="these cells, of any command")
     parser.add_argument("--minutes", type=float, default=8.5, help="begin and train no longer")
     parser.add_argument("--tiny", action="store_true", help="rehearse at sizes that mean nothing")
-    parser.add_argument("--ahead", type=pathlib.Path, help="folder for programs compiled ahead")
-    parser.add_argument("--compile-only", action="store_true", help="measure nothing")
+    parser.add_argument("--ahead", action="store_true", help="compile all cells in parallel first")
+    parser.add_argument("--wait", action="store_true", help=argparse.SUPPRESS)
     parser.add_argument("--store", action="store_true", help=f"write {STORED.name} from a CPU")
     options = parser.parse_args(arguments)
-    visit = Visit(options.tiny, time.monotonic() + 60 * options.minutes, options.compile_only)
+    visit = Visit(options.tiny, time.monotonic() + 60 * options.minutes)
+    if options.wait:
+        visit = dataclasses.replace(visit, ready=wait_for_turn)
     if options.store:
         if jax.default_backend() != "cpu":
             parser.error("--store keeps the values of a CPU: set JAX_PLATFORMS=cpu")
@@ -543,16 +572,16 @@ def main(arguments: list[str] | None = None) -> None:
         cells = [cell for cell in cells if cell.name in options.cells]
     cells = list(in_order(options.json, cells))
     if options.ahead:
-        compile_ahead(options.ahead, cells, visit)
+        measure_ahead(options.json, cells, visit)
+        return
     ending = threading.Timer(visit.left() + _GRACE_S, _end)
     ending.daemon = True
     ending.start()
     for cell in cells:
-        # What is compiled takes a third of the time.
-        if visit.left() < (cell.seconds / 3 if options.ahead else cell.seconds):
+        if not options.wait and visit.left() < cell.seconds:
             print(f"{cell.name}: left out, {visit.left():.0f} s are left", flush=True)
             continue
-        started, write = time.monotonic(), append(options.json, cell)
+        started, write = time.monotonic(), append(options.json, cell, ahead=options.wait)
         try:
             cell.measure(visit, write)
         except (jax.errors.JaxRuntimeError, ValueError) as error:

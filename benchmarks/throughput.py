@@ -101,8 +101,8 @@ def compile_training(config: mjx_arm.TrainConfig) -> Training:
 def peak_memory(training: Training) -> dict[str, int]:
     """Bytes that training comes to hold beyond what the process held once it was compiled.
 
-    On CPU by what of the heap is in use, looked at every millisecond; elsewhere by the device's own
-    count, which never forgets: after a figure that took more there is none.
+    Looked at every millisecond: of the device's memory what is in use, on CPU of the heap. The
+    device's own count of the most would not do, since trying out kernels may have taken more.
     """
     gc.collect()
 
@@ -115,13 +115,17 @@ def peak_memory(training: Training) -> dict[str, int]:
             # is given back, a moment after the result.
             time.sleep(0.05)
 
-    before = jax.devices()[0].memory_stats()
-    peak = heap_growth(train)
-    after = jax.devices()[0].memory_stats()
-    if before and after:
-        highest, was = after["peak_bytes_in_use"], before["peak_bytes_in_use"]
-        peak = highest - before["bytes_in_use"] if highest > was else None
+    peak = growth(train, device_in_use() or heap_in_use())
     return {} if peak is None else {"peak_bytes": peak}
+
+
+def device_in_use() -> Callable[[], int] | None:
+    """A function that returns the bytes in use on the device, where it counts them."""
+    device = jax.devices()[0]
+    # Also None where the device counts nothing.
+    if "bytes_in_use" not in (device.memory_stats() or {}):
+        return None
+    return lambda: device.memory_stats()["bytes_in_use"]
 
 
 class _Mallinfo2(ctypes.Structure):
@@ -137,28 +141,35 @@ class _Mallinfo2(ctypes.Structure):
     )
 
 
-def heap_growth(run: Callable[[], Any]) -> int | None:
-    """Bytes of the heap in use while `run` works, at their most, beyond those before; glibc only.
+def heap_in_use() -> Callable[[], int] | None:
+    """A function that returns the bytes of the heap in use; glibc only.
 
     The resident set would not do: a heap keeps pages of what was freed, and hands them out again.
     """
     mallinfo2 = getattr(ctypes.CDLL(None), "mallinfo2", None)
     if mallinfo2 is None:
-        run()
         return None
     mallinfo2.restype = _Mallinfo2
-    done = threading.Event()
-    seen: list[int] = []
 
-    def look() -> None:
+    def in_use() -> int:
         now = mallinfo2()
-        seen.append(now.uordblks + now.hblkhd)
+        return now.uordblks + now.hblkhd
+
+    return in_use
+
+
+def growth(run: Callable[[], Any], in_use: Callable[[], int] | None) -> int | None:
+    """How much more is in use at the most while `run` works than before."""
+    if in_use is None:
+        run()
+        return None
+    done = threading.Event()
+    seen = [in_use()]
 
     def keep_looking() -> None:
         while not done.wait(0.001):
-            look()
+            seen.append(in_use())
 
-    look()
     watcher = threading.Thread(target=keep_looking)
     watcher.start()
     try:

@@ -234,19 +234,25 @@ def _gpu(content: Any) -> Table:
             rows.append(_rate(content, own, "training of 8,192 environments, larger batches"))
             rows[-1][1] = "100,000 steps/s"
     rows += [_whole(content, "train-a", "A"), _whole(content, "train-b", "B"), _parity(content)]
-    for cell in (
-        *("convolution nn.Conv", "convolution patches"),
-        *("precision highest", "precision default"),
-        *("ray cast fused", "ray cast fenced"),
-        *("physics mjx", "physics mjx-warp"),
+    training = "training of 8,192 environments"
+    for cell, what, file in (
+        ("convolution patches", f"{training}, patches in place of `nn.Conv`", "comparisons"),
+        ("precision highest", f"{training}, the highest precision of matrices", "comparisons"),
+        (
+            "ray cast fenced",
+            "physics and rendering of 8,192 environments, images not fused with what reads them",
+            "comparisons",
+        ),
+        ("physics mjx", "physics alone of 8,192 environments, MJX", "comparisons"),
+        ("physics mjx-warp", "physics alone of 8,192 environments, MJX-Warp", "comparisons"),
+        (
+            "playground, physics",
+            "physics alone of 1,024 environments, as many as Playground's",
+            "published",
+        ),
+        ("squint", "training with Squint's published settings", "published"),
     ):
-        rows.append(_rate(content, cell, f"comparison of 8,192: {cell}", "comparisons"))
-    for cell, what in (
-        ("playground", "physics and rendering with Playground's 1,024 environments"),
-        ("playground, physics", "physics alone of the same"),
-        ("squint", "training with Squint's published settings"),
-    ):
-        rows.append(_rate(content, cell, what, "published"))
+        rows.append(_rate(content, cell, what, file))
     return ["what", "goal", "measured", "device"], rows
 
 

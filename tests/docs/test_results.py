@@ -132,7 +132,7 @@ def test_figures_of_a_gpu_that_are_missing_are_not_measured(tmp_path: pathlib.Pa
         "| physics and rendering of 8,192 environments | 400,000 steps/s | not measured |",
         "| training of 8,192 environments, larger batches | 100,000 steps/s | not measured |",
         "| memory of the training of 1,024 environments |  | not measured | not measured |",
-        "| comparison of 8,192: physics mjx-warp |  | not measured | not measured |",
+        "| physics alone of 8,192 environments, MJX-Warp |  | not measured | not measured |",
         "| training with Squint's published settings |  | not measured | not measured |",
     ):
         assert line in text
@@ -181,8 +181,8 @@ def test_figures_of_a_gpu_are_those_of_its_files(tmp_path: pathlib.Path):
     assert "environments | 2.82 GB planned | 3.10 GB | H100 |" in text
     # That one trains on fewer samples for each step than the preset.
     assert "larger batches | 100,000 steps/s | not measured |" in text
-    assert "| comparison of 8,192: physics mjx |  | 512,345 steps/s | H100 |" in text
-    assert "| comparison of 8,192: physics mjx-warp |  | not measured |" in text
+    assert "| physics alone of 8,192 environments, MJX |  | 512,345 steps/s | H100 |" in text
+    assert "| physics alone of 8,192 environments, MJX-Warp |  | not measured |" in text
 
 
 def test_a_gpu_is_compared_with_a_cpu(tmp_path: pathlib.Path):
