@@ -26,7 +26,7 @@ from mjx_arm.training.runner import resume, train
 PROCESSES = ("coordinator", "num_processes", "process_id")
 # Options that may change when a run is resumed.
 _CHANGEABLE = frozenset(
-    {"resume", "total_steps", "eval_episodes", "stop_at", "wandb", "devices", *PROCESSES}
+    {"resume", "total_steps", "eval_episodes", "video", "stop_at", "wandb", "devices", *PROCESSES}
 )
 
 
@@ -44,12 +44,13 @@ class Train:
         of a run.
       options: options of the run.
       out: folder for everything the run leaves; by default `runs/` and the time.
-      resume: folder of a run to continue; only `--total-steps`, `--eval-episodes`, `--stop-at`,
-        `--wandb` and the number of devices and processes may then be given.
+      resume: folder of a run to continue; only `--total-steps`, `--eval-episodes`, `--no-video`,
+        `--stop-at`, `--wandb` and the number of devices and processes may then be given.
       init_from: an agent or a run folder whose network the run starts from.
       stop_at: end the run when an evaluation that selects has reached this success rate.
       eval_episodes: episodes of the evaluation at the end, by the best agent, at epsilon 0.1 and on
         starts and random numbers that neither training nor the selection has seen.
+      video: record an episode of the best agent at the end.
       wandb: also log the run to Weights & Biases; `WANDB_MODE=offline` keeps it in the run folder.
       devices: number of local devices that share the work; by default as many as divide it.
       coordinator: `HOST:PORT` of process 0, where several processes train one run; each gets the
@@ -66,6 +67,7 @@ class Train:
     init_from: pathlib.Path | None = None
     stop_at: float | None = None
     eval_episodes: int = 200
+    video: bool = True
     wandb: bool = False
     devices: int | None = None
     coordinator: str | None = None
@@ -85,6 +87,7 @@ class Train:
                 out,
                 preset=self.preset if self.config is None else None,
                 eval_episodes=self.eval_episodes,
+                video=self.video,
                 stop_at=self.stop_at,
                 init_from=self.init_from,
                 on_chunk=on_chunk,
@@ -131,6 +134,7 @@ class Train:
                 folder,
                 total_steps=self.options.total_steps if "total_steps" in given else None,
                 eval_episodes=self.eval_episodes,
+                video=self.video,
                 stop_at=self.stop_at,
                 on_chunk=on_chunk,
                 devices=self.devices,

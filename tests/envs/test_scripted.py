@@ -16,7 +16,8 @@ LENGTH = 500
     ("name", "physics", "num_envs"),
     [
         ("A", "native", 1),
-        ("B", "native", 1000),
+        ("B", "native", 250),
+        pytest.param("B", "native", 1000, marks=pytest.mark.slow),
         pytest.param("A", "mjx", 1, marks=pytest.mark.slow),
         pytest.param("B", "mjx", 50, marks=pytest.mark.slow),
     ],

@@ -110,7 +110,7 @@ def test_a_training_is_logged_and_a_resumed_one_continues_there(tmp_path):
         "--preset state --physics native --num-envs 4 --replay-size 400 --batch-size 8 "
         "--learning-starts 40 --chunk-steps 80 --max-steps 15 --hidden 16 --select-every 0"
     )
-    ends = ["--eval-episodes", "2", "--wandb"]
+    ends = ["--eval-episodes", "2", "--no-video", "--wandb"]
     first = ["train", *options.split(), "--total-steps", "160", "--out", str(folder), *ends]
     assert main(first) == 0
     assert main(["train", "--resume", str(folder), "--total-steps", "240", *ends]) == 0

@@ -32,7 +32,7 @@ OPTIONS = [
     *("--preset", "pixels", "--observation", "state", "--physics", "native", "--num-envs", "8"),
     *("--replay-size", "800", "--batch-size", "8", "--learning-starts", "40", "--hidden", "16"),
     *("--chunk-steps", "160", "--max-steps", "15", "--size", "16", "16", "--eval-episodes", "4"),
-    *("--select-every", "3200", "--select-episodes", "4"),
+    *("--select-every", "3200", "--select-episodes", "4", "--no-video"),
 ]
 # A run of 40 chunks, with a checkpoint after every tenth.
 TOTAL = ["--total-steps", "6400"]
@@ -45,6 +45,7 @@ DISTILL = [
     *("--chunk-steps", "160", "--max-steps", "15", "--size", "16", "16"),
     *("--widths", "4", "4", "4", "--teacher-hidden", "16", "--teacher-batch-size", "16"),
     *("--student-batch-size", "8", "--student-starts", "160", "--select-every", "0"),
+    "--no-video",
 ]
 # Most of the time of a process here is compiling.
 OWN = {"PYTHONPATH": str(ROOT), "JAX_DISABLE_MOST_OPTIMIZATIONS": "1"}
@@ -328,12 +329,12 @@ def test_a_run_of_two_processes_is_stopped_and_resumed_to_the_bit(tmp_path):
     assert "saved; continue with" in ended[0][2]
     rows = read_metrics(cut)
     assert len(rows) < len(read_metrics(whole)) == 40
-    ended = finish(train("--resume", str(cut), "--eval-episodes", "4"))
+    ended = finish(train("--resume", str(cut), "--no-video", "--eval-episodes", "4"))
     assert [status for status, *_ in ended] == [0, 0], ended
     assert same(whole, again)
     assert same(whole, cut)
     names = sorted(path.name for path in whole.iterdir())
-    assert {"config.json", "metrics.jsonl", "last.safetensors", "policy.mp4"} <= set(names)
+    assert {"config.json", "metrics.jsonl", "last.safetensors", "evaluation.json"} <= set(names)
     assert names == sorted(path.name for path in cut.iterdir())
 
 
@@ -353,6 +354,7 @@ def test_a_signal_to_one_of_two_processes_stops_both_and_two_resume(tmp_path, ca
     assert "saved; continue with" in ended[0][2]
     done = RunCheckpoints(folder).steps()[-1] * 8
     arguments = ["--total-steps", str(done + 320), "--eval-episodes", "4"]
+    arguments += ["--no-video"]
     ended = finish(train("--resume", str(folder), *arguments))
     assert [status for status, *_ in ended] == [0, 0], ended
     assert f"resuming after {done:,} steps" in ended[0][1]
@@ -401,6 +403,7 @@ def test_when_a_process_is_lost_the_others_end_and_the_run_resumes_with_one(lost
     finish([started[lost]])
     done = RunCheckpoints(folder).steps()[-1] * 8
     arguments = ["--resume", str(folder), "--total-steps", str(done + 320), "--eval-episodes", "4"]
+    arguments += ["--no-video"]
     assert main(["train", *arguments]) == 0
     assert [row["env_steps"] for row in read_metrics(folder)] == list(range(160, done + 321, 160))
 
@@ -418,7 +421,7 @@ def test_a_run_of_four_devices_is_resumed_to_the_bit_and_on_fewer(tmp_path):
     said = run(*OPTIONS, "--total-steps", "3200", "--out", str(whole))
     assert "devices: 4, each with a part of the environments" in said
     run(*OPTIONS, "--total-steps", "1600", "--out", str(cut))
-    more = ["--resume", str(cut), "--eval-episodes", "4", "--total-steps"]
+    more = ["--resume", str(cut), "--no-video", "--eval-episodes", "4", "--total-steps"]
     run(*more, "3200")
     assert same(whole, cut)
     said = run(*more, "3520", "--devices", "2")

@@ -40,7 +40,7 @@ OPTIONS = [
     *("--physics", "native", "--num-envs", "4", "--size", "16", "16", "--replay-size", "400"),
     *("--batch-size", "8", "--learning-starts", "40", "--chunk-steps", "200"),
     *("--max-steps", "25", "--hidden", "16", "--eval-episodes", "4"),
-    *("--select-every", "2000", "--select-episodes", "2"),
+    *("--select-every", "2000", "--select-episodes", "2", "--no-video"),
 ]
 TOTAL_STEPS = 8_000
 # Processes that are killed at a random moment each.
@@ -109,7 +109,7 @@ def whole_run(tmp_path_factory) -> pathlib.Path:
 def test_more_steps_after_the_end_are_those_of_a_longer_run(whole_run, tmp_path):
     folder = tmp_path / "run"
     train(*OPTIONS, "--total-steps", "2000", "--out", str(folder))
-    train("--resume", str(folder), "--total-steps", "4000", "--eval-episodes", "4")
+    train("--resume", str(folder), "--total-steps", "4000", "--eval-episodes", "4", "--no-video")
     assert_same_run(folder, whole_run)
 
 
@@ -176,7 +176,7 @@ def test_a_run_that_has_saved_nothing_yet_begins_again(whole_run, tmp_path):
     # Nine chunks of 200 steps, and half of the line of the tenth: there is nothing else yet.
     lines = (whole_run / "metrics.jsonl").read_text().splitlines(keepends=True)
     (folder / "metrics.jsonl").write_text("".join(lines[:9]) + lines[9][:20])
-    train("--resume", str(folder), "--eval-episodes", "4")
+    train("--resume", str(folder), "--eval-episodes", "4", "--no-video")
     assert_same_run(folder, whole_run)
 
 
@@ -287,7 +287,7 @@ def test_a_disk_that_fills_up_leaves_the_last_whole_checkpoint(tmp_path):
     assert done.stderr.count("\n") == 1
     assert not list(folder.glob("checkpoints/*tmp*"))
     # Room again.
-    assert main(["train", "--resume", str(folder), "--eval-episodes", "4"]) == 0
+    assert main(["train", "--resume", str(folder), "--eval-episodes", "4", "--no-video"]) == 0
     assert load_agent(folder / "last.safetensors").env_steps == 4000
 
 
@@ -311,7 +311,7 @@ def run_with_kills(
 ) -> int:
     """Runs to the end through kills at random moments, and counts those."""
     first, kills = command(*OPTIONS, *options), 0
-    again = command("--resume", str(folder), "--eval-episodes", "4")
+    again = command("--resume", str(folder), "--eval-episodes", "4", "--no-video")
     while True:
         # Killed before there is a configuration, a run is started as if it never was.
         begun = (folder / "config.json").is_file()
