@@ -70,8 +70,9 @@ test: $(STAMP)
 	$(BIN)/mypy
 	$(BIN)/python -m pytest --numprocesses auto --dist loadfile
 
+# Two at a time: most of a test is compiling. More would disturb those that keep to real time.
 test-slow: $(STAMP)
-	$(BIN)/python -m pytest -m slow
+	$(BIN)/python -m pytest --numprocesses 2 --dist loadfile -m slow
 
 test-long: $(STAMP)
 	$(BIN)/python -m pytest -m long

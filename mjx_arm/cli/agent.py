@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
 import pathlib
@@ -16,6 +17,7 @@ from mjx_arm.devices import check_device
 from mjx_arm.envs.randomisation import RandomisationConfig
 from mjx_arm.export import check_path, image_shape, write_policy
 from mjx_arm.options import option_names
+from mjx_arm.report.progress import make_console, phase
 from mjx_arm.report.video import check_video_path, record_episode, render_episode, write_video
 from mjx_arm.training.agent import STORED, Agent, differences, load_agent
 from mjx_arm.training.evaluate import evaluate
@@ -103,15 +105,19 @@ class Eval(AgentOptions):
         """Runs the command."""
         del given
         agent = self.load()
-        result = evaluate(
-            agent.env,
-            agent.apply,
-            agent.params,
-            episodes=self.episodes,
-            epsilon=self.epsilon,
-            key=self.key(),
-            mesh=make_mesh(jax.local_device_count()),
-        )
+        what = f"evaluating: {self.episodes} episodes in {agent.config.env.env}"
+        # Standard output with nothing but JSON can be piped.
+        said = contextlib.nullcontext() if self.json else phase(make_console(), what)
+        with said:
+            result = evaluate(
+                agent.env,
+                agent.apply,
+                agent.params,
+                episodes=self.episodes,
+                epsilon=self.epsilon,
+                key=self.key(),
+                mesh=make_mesh(jax.local_device_count()),
+            )
         report = dataclasses.asdict(result)
         if self.json:
             print(json.dumps(report))
@@ -135,11 +141,13 @@ class Play(AgentOptions):
         """Runs the command."""
         del given
         check_video_path(self.out)
-        agent = self.load()
-        episode = record_episode(
-            agent.env, agent.apply, agent.params, epsilon=self.epsilon, key=self.key()
-        )
-        write_video(self.out, render_episode(agent.env, episode))
+        agent, console = self.load(), make_console()
+        with phase(console, f"an episode in {agent.config.env.env}", "compiling comes first"):
+            episode = record_episode(
+                agent.env, agent.apply, agent.params, epsilon=self.epsilon, key=self.key()
+            )
+        with phase(console, "rendering the video"):
+            write_video(self.out, render_episode(agent.env, episode))
         print(f"{self.out}: {len(episode)} frames, success: {episode.success}")
 
 
