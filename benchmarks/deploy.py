@@ -82,13 +82,15 @@ def measure(
     inference = np.concatenate([x.inference_ms for x in outcomes])
     ages = np.concatenate([x.image_age_ms for x in outcomes])
     ticks, misses = sum(x.ticks for x in outcomes), sum(x.misses for x in outcomes)
+    skipped = sum(x.skipped for x in outcomes)
     return {
         "rate": rate,
         "seconds": options.seconds,
         "level": options.level,
         "ticks": ticks,
         "misses": misses,
-        "missed_share": misses / ticks,
+        "skipped": skipped,
+        "missed_share": (misses + skipped) / (ticks + skipped),
         "faults": faults,
         "watchdog": options.watchdog,
         "rejected": sum(x.rejected for x in outcomes),

@@ -17,7 +17,7 @@ from mjx_arm.algos.exploration import check_epsilon
 from mjx_arm.cli.agent import check_seed, print_report
 from mjx_arm.deploy.camera import VideoCamera
 from mjx_arm.deploy.dynamixel import DynamixelConfig, DynamixelRobot, read_config
-from mjx_arm.deploy.guard import make_guard
+from mjx_arm.deploy.guard import Guard, make_guard
 from mjx_arm.deploy.log import Log, replay
 from mjx_arm.deploy.loop import LoopConfig, describe_outcome, run_loop, stop_on_signals
 from mjx_arm.deploy.robot import Robot
@@ -206,7 +206,7 @@ class Deploy(StandInOptions):
         }
         with (
             stop_on_signals() as stop,
-            self._connect(agent, arm) as (robot, until),
+            self._connect(agent, arm, guard) as (robot, until),
             Log(path, {**header, "workspace": guard.box.tolist()}) as log,
         ):
             outcome = run_loop(robot, policy, guard, config, log, stop=stop, until=until)
@@ -217,7 +217,7 @@ class Deploy(StandInOptions):
 
     @contextlib.contextmanager
     def _connect(
-        self, agent: Agent, arm: DynamixelConfig | None
+        self, agent: Agent, arm: DynamixelConfig | None, guard: Guard
     ) -> Iterator[tuple[Robot, Callable[[], bool] | None]]:
         """The robot, and what says that the task is done, if anything does."""
         with contextlib.ExitStack() as stack:
@@ -225,7 +225,7 @@ class Deploy(StandInOptions):
                 assert arm is not None
                 camera = VideoCamera(arm.camera, agent.env.config.size)
                 stack.callback(camera.close)
-                yield stack.enter_context(DynamixelRobot(arm, camera.frame)), None
+                yield stack.enter_context(DynamixelRobot(arm, camera.frame, guard.limits)), None
                 return
             port = self.port
             if port is None:

@@ -129,6 +129,8 @@ class DynamixelRobot:
     Args:
       config: of the arm.
       frame: gives the newest image, as `mjx_arm.deploy.camera.VideoCamera.frame`.
+      limits: `[n, 2] float64`, degrees, which no target of a joint leaves, as `Guard.limits`. The
+        guard knows where a joint is, and its target may be some degrees ahead of that.
       tries: attempts at a transfer.
 
     Raises:
@@ -138,7 +140,12 @@ class DynamixelRobot:
     """
 
     def __init__(
-        self, config: DynamixelConfig, frame: Callable[[], Frame], *, tries: int = _TRIES
+        self,
+        config: DynamixelConfig,
+        frame: Callable[[], Frame],
+        limits: np.ndarray,
+        *,
+        tries: int = _TRIES,
     ) -> None:
         try:
             import dynamixel_sdk
@@ -147,7 +154,12 @@ class DynamixelRobot:
                 "an arm of Dynamixel servos needs dynamixel-sdk: pip install 'mjx_arm[deploy]'"
             ) from error
         self._sdk: Any = dynamixel_sdk
-        self.config, self._frame, self._tries = config, frame, tries
+        if np.shape(limits) != (len(config.joints), 2):
+            raise ValueError(
+                f"limits must be a lower and an upper one of {len(config.joints)} joints, got the "
+                f"shape {np.shape(limits)}"
+            )
+        self.config, self._frame, self._limits, self._tries = config, frame, limits, tries
         self._signs = np.asarray(config.signs, np.float64)
         self._zeros = np.asarray(config.zeros, np.float64)
         self._packets = dynamixel_sdk.PacketHandler(2.0)
@@ -218,7 +230,10 @@ class DynamixelRobot:
 
     def move_joint(self, joint: int, degrees: float) -> None:
         """See `Robot`."""
-        self._targets[joint] += degrees
+        low, high = self._limits[joint]
+        was = self._targets[joint]
+        # A joint that begins beyond its range may only come back.
+        self._targets[joint] = np.clip(was + degrees, min(low, was), max(high, was))
         self._write(self.config.joints[joint], _GOAL_POSITION, self._ticks(joint))
 
     def open(self) -> None:

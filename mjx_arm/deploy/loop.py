@@ -76,6 +76,8 @@ class Outcome:
       reason: one sentence.
       ticks: number of complete ticks; one in which the robot fails is not complete.
       misses: ticks that were not over before the next one was due.
+      skipped: ticks that were due while a late one lasted, and were left out. Their deadlines were
+        missed as well: of `ticks + skipped` deadlines `misses + skipped` were missed.
       rejected: actions that the guard did not let through.
       inference_ms: `[ticks] float64`, time of the policy, ms.
       image_age_ms: `[ticks] float64`, age of the image when the action was sent, ms.
@@ -85,6 +87,7 @@ class Outcome:
     reason: str
     ticks: int
     misses: int
+    skipped: int
     rejected: int
     inference_ms: np.ndarray
     image_age_ms: np.ndarray
@@ -93,6 +96,7 @@ class Outcome:
 @dataclasses.dataclass
 class _Tally:
     misses: int = 0
+    skipped: int = 0
     rejected: int = 0
     inference_ms: list[float] = dataclasses.field(default_factory=list)
     image_age_ms: list[float] = dataclasses.field(default_factory=list)
@@ -171,7 +175,8 @@ class _Loop:
                     self.log.write(self._last_line(ending, reason))
         tally = self.tally
         ages, times = np.asarray(tally.image_age_ms), np.asarray(tally.inference_ms)
-        return Outcome(ending, reason, len(times), tally.misses, tally.rejected, times, ages)
+        counts = len(times), tally.misses, tally.skipped, tally.rejected
+        return Outcome(ending, reason, *counts, times, ages)
 
     def _ticks(self) -> tuple[Ending, str]:
         period, tick = 1 / self.config.rate, 0
@@ -184,7 +189,9 @@ class _Loop:
                 return "done", f"the time of {self.config.seconds:g} s is up"
             late = self._tick(tick, start + (tick + 1) * period)
             passed = self.clock.now() - start
-            tick = max(tick + 1, int(passed / period) + 1) if late else tick + 1
+            due = max(tick + 1, int(passed / period) + 1) if late else tick + 1
+            self.tally.skipped += due - tick - 1
+            tick = due
             self.clock.wait_until(start + tick * period, self.stop)
         return "stopped", "stopped by the user"
 
@@ -200,6 +207,8 @@ class _Loop:
         action, rejected = self._choose(best), None
         if action < 2 * len(angles):
             rejected = self.guard.rejects(angles, action // 2, self._step(action))
+        # Again, for joints and policy may have taken long.
+        self._check_age(frame)
         sends = rejected is None and not self.config.dry_run and not self.stop.is_set()
         try:
             if sends:
@@ -236,6 +245,9 @@ class _Loop:
             check_image(frame.image, self.policy.image_shape)
         except ValueError as error:
             raise RobotError(f"the camera gives something else: {error}") from error
+        self._check_age(frame)
+
+    def _check_age(self, frame: Frame) -> None:
         age = self.clock.now() - frame.time
         # A camera whose clock is wrong would keep the watchdog quiet for ever.
         if not -self.config.watchdog <= age <= self.config.watchdog:
@@ -283,6 +295,7 @@ class _Loop:
             "ending": ending,
             "ticks": len(tally.inference_ms),
             "misses": tally.misses,
+            "skipped": tally.skipped,
             "rejected": tally.rejected,
         }
 
@@ -294,6 +307,7 @@ def describe_outcome(outcome: Outcome) -> dict[str, Any]:
         "reason": outcome.reason,
         "ticks": outcome.ticks,
         "misses": outcome.misses,
+        "skipped": outcome.skipped,
         "rejected": outcome.rejected,
     }
     for name in ("inference_ms", "image_age_ms"):

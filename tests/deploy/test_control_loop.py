@@ -118,6 +118,7 @@ def test_a_late_tick_is_a_miss_and_nothing_is_caught_up(run) -> None:
 
     made = run(prepare=prepare)
     assert made.outcome.misses == 1
+    assert made.outcome.skipped == 2
     assert made.outcome.ticks == 25 - 2
     ticks = [record["tick"] for record in read_log(made.path).ticks]
     assert ticks == [0, 1, 2, 3, *range(6, 25)]
@@ -191,6 +192,16 @@ def silent(robot: TwoJoints) -> None:
     robot.make_frame = lambda number: good(number) if number < 5 else last
 
 
+def slow(robot: TwoJoints) -> None:
+    good = robot.make_angles
+
+    def make() -> object:
+        robot.clock.pass_(0.31 if robot.frames > 4 else 0.0)
+        return good()
+
+    robot.make_angles = make
+
+
 BAD_INPUT = {
     "shape": (
         lambda robot: image_of(robot, np.zeros((6, 4, 3), np.uint8)),
@@ -213,6 +224,8 @@ BAD_INPUT = {
         lambda robot: angles_of(robot, np.zeros(3)),
         r"must report 2 joint angles, got the shape \[3\]",
     ),
+    # The image was new when it was taken, and is not when the command would be sent.
+    "slow joints": (slow, "the camera is silent: its newest image is 0.3. s old, and 0.3 s"),
     "silent": (silent, "the camera is silent: its newest image is 0.3. s old, and 0.3 s"),
 }
 

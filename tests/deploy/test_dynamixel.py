@@ -37,6 +37,10 @@ def patient(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(port_handler, "LATENCY_TIMER", 100)
 
 
+# Of the six joints, degrees.
+LIMITS = np.tile([-360.0, 360.0], (6, 1))
+
+
 @pytest.fixture
 def bus() -> Iterator[Bus]:
     servos = {joint: Servo(position=2048 + 10 * joint) for joint in JOINTS}
@@ -46,7 +50,7 @@ def bus() -> Iterator[Bus]:
 
 @pytest.fixture
 def robot(bus: Bus) -> Iterator[DynamixelRobot]:
-    with DynamixelRobot(config(bus.port), frame) as made:
+    with DynamixelRobot(config(bus.port), frame, LIMITS) as made:
         yield made
 
 
@@ -87,7 +91,7 @@ def test_angles_and_steps_are_in_degrees(bus, robot) -> None:
 def test_signs_zeros_and_negative_positions(bus) -> None:
     signs, zeros = (1, -1, 1, 1, 1, 1), (2048, 1000, 2048, 2048, 2048, 2048)
     bus.servos[1].set(PRESENT, 4, -3)
-    with DynamixelRobot(config(bus.port, signs=signs, zeros=zeros), frame) as robot:
+    with DynamixelRobot(config(bus.port, signs=signs, zeros=zeros), frame, LIMITS) as robot:
         angles = robot.joint_angles()
         assert angles[0] == pytest.approx((-3 - 2048) * 360 / 4096)
         assert angles[1] == pytest.approx(-(2068 - 1000) * 360 / 4096)
@@ -95,6 +99,26 @@ def test_signs_zeros_and_negative_positions(bus) -> None:
         assert bus.servos[2].get(GOAL, 4) == round(2068 - 4096 / 360)
         robot.move_joint(0, -1.0)
         assert bus.servos[1].get(GOAL, 4) == round(-3 - 4096 / 360)
+
+
+def test_no_target_leaves_the_range_of_its_joint(bus) -> None:
+    begins = (2058 - 2048) * 360 / 4096
+    limits = LIMITS.copy()
+    # The second joint begins beyond its range.
+    limits[0], limits[1] = (-360.0, begins + 1.5), (-360.0, 0.0)
+    with DynamixelRobot(config(bus.port), frame, limits) as robot:
+        for _ in range(4):
+            robot.move_joint(0, 1.0)
+            robot.move_joint(1, 1.0)
+        assert bus.servos[1].get(GOAL, 4) == round(2058 + 1.5 * 4096 / 360)
+        assert bus.servos[2].get(GOAL, 4) == 2068
+        robot.move_joint(1, -1.0)
+        assert bus.servos[2].get(GOAL, 4) == round(2068 - 4096 / 360)
+
+
+def test_limits_are_those_of_the_joints(bus) -> None:
+    with pytest.raises(ValueError, match=r"upper one of 6 joints, got the shape \(2, 2\)"):
+        DynamixelRobot(config(bus.port), frame, LIMITS[:2])
 
 
 def test_one_wrong_checksum_is_asked_again(bus, robot) -> None:
@@ -140,7 +164,7 @@ def test_answers_that_are_too_late_are_no_answers(bus, robot) -> None:
 def test_a_missing_id_is_named_at_the_beginning(bus) -> None:
     del bus.servos[6]
     with pytest.raises(RobotError, match=r"servo 6 \(joint 3\) does not answer"):
-        DynamixelRobot(config(bus.port), frame)
+        DynamixelRobot(config(bus.port), frame, LIMITS)
 
 
 @pytest.mark.parametrize(
@@ -154,7 +178,7 @@ def test_a_fault_of_a_servo_is_named(bus, robot, bits, words) -> None:
             call()
     robot.stop()  # holds all the same
     with pytest.raises(RobotError, match="reports a fault"):
-        DynamixelRobot(config(bus.port), frame)
+        DynamixelRobot(config(bus.port), frame, LIMITS)
 
 
 def test_a_joint_that_does_not_follow_is_named(bus, robot) -> None:
@@ -175,7 +199,7 @@ def test_a_wrong_operating_mode_is_rejected(bus) -> None:
     with pytest.raises(
         RobotError, match=r"servo 9 \(gripper\) is in operating mode 16, set 3 or 5"
     ):
-        DynamixelRobot(config(bus.port), frame)
+        DynamixelRobot(config(bus.port), frame, LIMITS)
 
 
 def test_a_cable_that_is_pulled_is_one_sentence(bus, robot) -> None:
@@ -196,7 +220,7 @@ def test_a_port_that_has_failed_is_named_once(bus, robot, monkeypatch) -> None:
 
 def test_a_port_that_is_not_there() -> None:
     with pytest.raises(RobotError, match="the port /dev/none cannot be opened"):
-        DynamixelRobot(config("/dev/none"), frame)
+        DynamixelRobot(config("/dev/none"), frame, LIMITS)
 
 
 @pytest.mark.parametrize(
