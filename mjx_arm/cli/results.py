@@ -15,7 +15,7 @@ from mjx_arm.report.figures import plot_curves
 from mjx_arm.report.progress import make_console
 from mjx_arm.report.run_page import write_report
 from mjx_arm.reproduce.command import reproduce
-from mjx_arm.tools.compare import describe, read_result, to_json, write_comparison
+from mjx_arm.tools.compare import describe, read_results, to_json, write_comparison
 from mjx_arm.tools.zoo import describe_zoo, read_shipped, read_zoo
 from mjx_arm.training.run_folder import load_config, seed_folders
 from mjx_arm.view.viewer import ViewOptions, view
@@ -59,7 +59,7 @@ class Compare:
     def run(self, given: frozenset[str]) -> None:
         """Runs the command."""
         del given
-        results = [read_result(folder) for folder in self.runs]
+        results = read_results(self.runs)
         print(json.dumps(to_json(results)) if self.json else describe(results))
         if self.out is not None:
             write_comparison(results, self.out)

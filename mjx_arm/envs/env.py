@@ -190,10 +190,7 @@ class Env:
         kind = self.config.observation
         if kind == "state":
             return self.features(state)
-        if self.randomiser:
-            image = self.look(self.shown_qpos(state), self.image_params(state.params))
-        else:
-            image = self.render(state.physics.qpos, state.physics.poses, state.params)
+        image = self.image(state)
         if kind == "rgb":
             return rgb(image[0])
         if kind == "segmentation":
@@ -201,6 +198,12 @@ class Env:
         if kind == "rgbd":
             return {"rgb": rgb(image[0]), "depth": image[1]}
         return image[0]
+
+    def image(self, state: EnvState) -> tuple[jax.Array, ...]:
+        """What the camera shows of a state, an earlier one if images are delayed; see `render`."""
+        if self.randomiser:
+            return self.look(self.shown_qpos(state), self.image_params(state.params))
+        return self.render(state.physics.qpos, state.physics.poses, state.params)
 
     def render(self, qpos: jax.Array, poses: Poses, params: Params) -> tuple[jax.Array, ...]:
         """Packed pixels `[H, W] uint32`, and for `"rgbd"` the depth; see `observe`."""

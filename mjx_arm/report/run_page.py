@@ -59,8 +59,8 @@ def write_report(
         html.pictures(draw_panels(seeds, units=find_task(config.env.task).units)),
         *(_evaluation_section(folder) if len(seeds) == 1 else ()),
         "<h2>Configuration</h2>",
-        '<p class="quiet">Bold options differ from the default of <code>mjx-arm train</code> '
-        "without a preset.</p>",
+        '<p class="quiet">Bold options differ from the defaults that the documentation lists under '
+        "Options. Presets change some of these.</p>",
         _configuration(config),
         "<h2>What to do with it</h2>",
         html.commands(_commands(folder, seeds)),

@@ -35,12 +35,14 @@ class Episode:
 
     Attributes:
       qpos: `[L, nq] float32`, before each step and after the last.
+      shown: `[L, nq] float32`, what the images of these states show: earlier ones, if delayed.
       max_q: `[L] float32`, the largest Q-value in each of these states.
       params: values of the model's fields that vary by episode.
       success: it ended in success.
     """
 
     qpos: np.ndarray
+    shown: np.ndarray
     max_q: np.ndarray
     params: Params
     success: bool
@@ -75,7 +77,8 @@ def record_episode(
         q = apply(params, obs)
         _action, after, transition = act(auto, act_key, envs, q, jnp.float32(epsilon))
         ended = (transition.terminated | transition.truncated)[0]
-        seen = (envs.env.physics.qpos[0], jnp.max(q), running)
+        shown = jax.vmap(env.shown_qpos)(envs.env)[0]
+        seen = (envs.env.physics.qpos[0], shown, jnp.max(q), running)
         return (after, key, running & ~ended), (*seen, running & transition.terminated[0])
 
     def run(key: jax.Array) -> tuple[Any, ...]:
@@ -87,9 +90,11 @@ def record_episode(
         return jax.tree.map(lambda x: x[0], envs.env.params), *records
 
     compiled = jax.jit(run, compiler_options=compiler_options(env.physics))
-    episode_params, qpos, max_q, running, success = jax.device_get(compiled(key))
+    episode_params, qpos, shown, max_q, running, success = jax.device_get(compiled(key))
     frames = int(running.sum()) + 1
-    return Episode(qpos[:frames], max_q[:frames], episode_params, bool(success.any()))
+    return Episode(
+        qpos[:frames], shown[:frames], max_q[:frames], episode_params, bool(success.any())
+    )
 
 
 def render_episode(env: Env, episode: Episode) -> Iterator[np.ndarray]:
@@ -105,20 +110,22 @@ def render_episode(env: Env, episode: Episode) -> Iterator[np.ndarray]:
     size = (_EDGE, _EDGE)
     large = env.with_cameras(size=size, shadows=True)
 
-    def render(qpos: jax.Array) -> tuple[jax.Array, jax.Array]:
-        poses = kinematics(qpos, episode.params)
-        images = (x.render(qpos, poses, episode.params)[0] for x in (large, env))
-        scene, view = (rgb(_first_camera(image, env)) for image in images)
-        return scene, view
+    def render(qpos: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, ...]:
+        images = (
+            x.render(now, kinematics(now, episode.params), episode.params)[0]
+            for x, now in zip((large, env), qpos, strict=True)
+        )
+        return tuple(rgb(_first_camera(image, env)) for image in images)
 
-    render_some = jax.jit(lambda q: jax.lax.map(render, q))
+    render_some = jax.jit(lambda *qpos: jax.lax.map(render, qpos))
     rows, columns = (np.arange(_EDGE) * edge // _EDGE for edge in env.config.size)
     for start in range(0, len(episode.qpos), _AT_ONCE):
-        qpos = episode.qpos[start : start + _AT_ONCE]
+        parts = [x[start : start + _AT_ONCE] for x in (episode.qpos, episode.shown)]
+        count = len(parts[0])
         # All parts have one length: another length would compile again.
-        padded = np.concatenate([qpos, np.repeat(qpos[-1:], _AT_ONCE - len(qpos), axis=0)])
-        scenes, views = jax.device_get(render_some(padded))
-        for i, (scene, view) in enumerate(zip(scenes[: len(qpos)], views, strict=False)):
+        padded = [np.concatenate([x, np.repeat(x[-1:], _AT_ONCE - count, axis=0)]) for x in parts]
+        scenes, views = jax.device_get(render_some(*padded))
+        for i, (scene, view) in enumerate(zip(scenes[:count], views, strict=False)):
             frame = np.concatenate([scene, view[rows][:, columns]], axis=1)
             yield _label(frame, env, episode, start + i)
 

@@ -83,16 +83,50 @@ def share_of(counts: Sequence[tuple[int, int]]) -> Share | None:
       counts: successes and episodes of each seed.
 
     Returns:
-      One seed: Wilson's interval, over its episodes. Several: Student's, over the seeds. None
+      One seed: Wilson's interval, over its episodes. Several: Student's, over the seeds; where
+      all have the same rate it would have no width, and Wilson's over all episodes is taken. None
       where there is no seed.
     """
     if not counts:
         return None
-    if len(counts) == 1:
-        ((successes, episodes),) = counts
+    if _are_equal(counts):
+        successes, episodes = _pooled(counts)
         return Share(successes / episodes, *wilson_interval(successes, episodes), over="episodes")
     mean, half = _mean_and_half_width([s / n for s, n in counts])
     return Share(mean, max(0.0, mean - half), min(1.0, mean + half), over="seeds")
+
+
+def _are_equal(counts: Sequence[tuple[int, int]]) -> bool:
+    """Whether all seeds have the same rate, as a single one has."""
+    return len({successes / episodes for successes, episodes in counts}) == 1
+
+
+def _pooled(counts: Sequence[tuple[int, int]]) -> tuple[int, int]:
+    return sum(successes for successes, _ in counts), sum(episodes for _, episodes in counts)
+
+
+def read_results(folders: Sequence[pathlib.Path]) -> list[RunResult]:
+    """Reads runs, whose names are the ends of their paths in which they differ.
+
+    Raises:
+      ValueError: see `read_result`, or a folder is given twice.
+    """
+    paths = [folder.resolve() for folder in folders]
+    for path in paths:
+        if paths.count(path) > 1:
+            raise ValueError(f"{path} is given twice")
+    results = [read_result(folder) for folder in folders]
+    return [
+        dataclasses.replace(result, name=_short_name(path, paths))
+        for result, path in zip(results, paths, strict=True)
+    ]
+
+
+def _short_name(path: pathlib.Path, paths: Sequence[pathlib.Path]) -> str:
+    """The shortest end of a path that no other path has."""
+    ends = (path.parts[-length:] for length in range(1, len(path.parts) + 1))
+    own = (end for end in ends if [p.parts[-len(end) :] for p in paths].count(end) == 1)
+    return "/".join(next(own))
 
 
 def read_result(folder: pathlib.Path) -> RunResult:
@@ -131,8 +165,8 @@ def _reached(seeds: Sequence[list[dict[str, float]]], level: float) -> tuple[flo
 def difference(first: RunResult, other: RunResult) -> tuple[float, float, float] | None:
     """The success rate of `other` minus that of `first`, with its 95 % interval.
 
-    Two runs of one seed: Newcombe's interval, over episodes. Two runs of several: Welch's, over
-    seeds.
+    Two runs of one seed, or of several that have the same rate: Newcombe's interval, over
+    episodes. Two runs of several: Welch's, over seeds.
 
     Returns:
       Difference, lower and upper bound; None if a run was not evaluated, or only one has several
@@ -141,7 +175,8 @@ def difference(first: RunResult, other: RunResult) -> tuple[float, float, float]
     one, two = first.counts, other.counts
     if not one or not two or (len(one) == 1) != (len(two) == 1):
         return None
-    if len(one) == 1:
+    if _are_equal(one) and _are_equal(two):
+        one, two = (_pooled(one),), (_pooled(two),)
         low, high = newcombe_interval(*two[0], *one[0])
         return two[0][0] / two[0][1] - one[0][0] / one[0][1], low, high
     return _welch([s / n for s, n in one], [s / n for s, n in two])
@@ -156,8 +191,6 @@ def _mean_and_half_width(values: Sequence[float]) -> tuple[float, float]:
 def _welch(first: Sequence[float], other: Sequence[float]) -> tuple[float, float, float]:
     a, b = (float(np.var(x, ddof=1)) / len(x) for x in (first, other))
     middle = float(np.mean(other) - np.mean(first))
-    if a + b == 0.0:
-        return middle, middle, middle
     freedom = (a + b) ** 2 / (a**2 / (len(first) - 1) + b**2 / (len(other) - 1))
     half = float(student_t.ppf(0.975, freedom)) * math.sqrt(a + b)
     return middle, middle - half, middle + half
@@ -180,11 +213,11 @@ def remarks(results: Sequence[RunResult]) -> list[str]:
     overs = {share.over for result in results if (share := result.share) is not None}
     if len(overs) > 1:
         said.append(
-            "Some intervals are over the episodes of one seed, others over seeds; only the latter "
-            "say how much another seed would differ."
+            "Some intervals are over episodes, others over seeds; only the latter say how much "
+            "another seed would differ."
         )
     elif overs == {"episodes"}:
-        said.append("Intervals are over the episodes of one seed; another seed may differ more.")
+        said.append("Intervals are over episodes; another seed may differ more.")
     return said
 
 

@@ -21,7 +21,7 @@ from mjx_arm.report.figures import draw_groups
 from mjx_arm.report.run_page import percent
 from mjx_arm.tools.search_space import Dimension, check_space, suggest
 from mjx_arm.tools.zoo import text_table
-from mjx_arm.training.runner import train
+from mjx_arm.training.runner import RunInterruptedError, train
 
 _JOURNAL = "sweep.journal"
 _PAGE = "sweep.html"
@@ -63,9 +63,9 @@ def sweep(
     """Trains with many values of some options, and ranks them by success.
 
     Optuna's TPE sampler suggests the values. A trial ends early where its best selection is below
-    the median of the earlier trials at the same step. Each trial is a run folder like any other,
+    the median of the complete trials at the same step. Each trial is a run folder like any other,
     without the video. A sweep that was stopped continues when it is started again with the same
-    folder.
+    folder; the trial that was cut off counts as failed, and another one takes its place.
 
     Args:
       config: the options that do not vary; `select_every` must be above 0.
@@ -82,7 +82,7 @@ def sweep(
     Raises:
       ValueError: the extra `sweep` is missing, options do not fit, or the folder is that of
         another sweep.
-      RunInterruptedError: Ctrl-C or a signal.
+      RunInterruptedError: Ctrl-C or a signal; the page shows the trials so far.
     """
     optuna = import_optuna()
     check_value("trials", Count, trials)
@@ -97,14 +97,21 @@ def sweep(
     def objective(trial: Any) -> float:
         return _run_trial(optuna, trial, config, space, folder, eval_episodes, console)
 
-    left = trials - len(study.trials)
-    if left > 0:
-        study.optimize(objective, left, timeout=None if minutes is None else 60 * minutes)
-    ranked = _rank(study, folder)
-    html.write_page(
-        folder / _PAGE,
-        html.document("Sweep: mjx_arm", _page(ranked, space, find_task(config.env.task).units)),
-    )
+    failed = optuna.trial.TrialState.FAIL
+    left = trials - sum(trial.state != failed for trial in study.trials)
+    try:
+        if left > 0:
+            study.optimize(objective, left, timeout=None if minutes is None else 60 * minutes)
+    except RunInterruptedError:
+        raise RunInterruptedError(
+            f"stopped; the same command with --out {folder} goes on with the sweep"
+        ) from None
+    finally:
+        ranked = _rank(study, folder)
+        units = find_task(config.env.task).units
+        html.write_page(
+            folder / _PAGE, html.document("Sweep: mjx_arm", _page(ranked, space, units))
+        )
     return ranked
 
 
@@ -195,14 +202,19 @@ def _run_trial(
             raise optuna.TrialPruned
 
     quiet = Console(quiet=True)
-    results = train(
-        options,
-        _trial_folder(folder, trial.number),
-        eval_episodes=eval_episodes,
-        on_chunk=look,
-        video=False,
-        console=quiet,
-    )
+    try:
+        results = train(
+            options,
+            _trial_folder(folder, trial.number),
+            eval_episodes=eval_episodes,
+            on_chunk=look,
+            video=False,
+            console=quiet,
+        )
+    except ValueError as error:
+        # Such as options that need more memory than there is.
+        console.print(f"trial {trial.number}: pruned, {error}", soft_wrap=True)
+        raise optuna.TrialPruned(str(error)) from None
     rate = float(np.mean([result.rate for result in results]))
     console.print(f"trial {trial.number}: {percent(rate)} of {eval_episodes} episodes")
     return rate

@@ -252,6 +252,8 @@ def watching_others() -> Iterator[None]:
         return
     from orbax.checkpoint import multihost
 
+    # Else one that comes later, from a program of its own, would be called lost.
+    wait_for_all()
     meet, over, own = multihost.get_barrier_sync_fn(), threading.Event(), next(_watches)
 
     def watch() -> None:

@@ -60,7 +60,7 @@ class Panel:
         self._agents: Any = None
         if choices:
             agents = self._gui.add_dropdown("agent", list(choices), initial_value=chosen)
-            agents.on_update(lambda _: send("choose", agents.value))
+            agents.on_update(self._changed("choose", lambda: agents.value))
             self._agents = agents
         self._pause = self._gui.add_button("Pause")
         self._pause.on_click(lambda _: send("pause", None))
@@ -96,6 +96,10 @@ class Panel:
     def offer(self, choices: Sequence[str]) -> None:
         """Changes the agents to choose from; the one that is shown stays chosen."""
         self._agents.options = tuple(choices)
+
+    def choose(self, name: str) -> None:
+        """Shows which agent is chosen."""
+        self._agents.value = name
 
     def _changed(self, name: str, value: Callable[[], Any]) -> Callable[[Any], None]:
         """Sends what a visitor changed, not what the program itself set."""

@@ -94,8 +94,7 @@ def make_simulation(env: Env, apply: Apply | None = None) -> Simulation:
     compile_ = functools.partial(jax.jit, compiler_options=compiler_options(env.physics))
 
     def look(params: Any, state: EnvState) -> Look:
-        pixels = env.render(state.physics.qpos, state.physics.poses, state.params)[0]
-        image = rgb(pixels)
+        image = rgb(env.image(state)[0])
         if len(env.cameras) > 1:
             image = jnp.concatenate(list(image), axis=1)
         q = jnp.zeros((0,), jnp.float32)

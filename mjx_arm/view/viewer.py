@@ -246,6 +246,8 @@ class Viewer:
             self.session = self._load(choice, self.session.seed)
         except ValueError as error:
             self._error = f"{choice.name} cannot be shown: {error}"
+            if self._choice is not None:
+                self._panel.choose(self._choice.name)
             return
         self._error = ""
         self.session.epsilon, self.session.actor = before.epsilon, before.actor
@@ -268,6 +270,7 @@ class Viewer:
         except ValueError as error:
             self._error = str(error)
             return
+        self._error = ""
         if found is None:
             self._choose(choice.name)
             return

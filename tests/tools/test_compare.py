@@ -13,6 +13,7 @@ from mjx_arm.tools.compare import (
     difference,
     different_options,
     read_result,
+    read_results,
     remarks,
     write_comparison,
 )
@@ -56,6 +57,29 @@ def test_two_runs_of_several_seeds_differ_by_welchs_interval(runs, tmp_path):
     # Equal variances: four degrees of freedom, 2.7764 * 0.05 * sqrt(2 / 3).
     assert middle == pytest.approx(0.1)
     assert high - middle == pytest.approx(middle - low) == pytest.approx(0.11335, abs=1e-5)
+
+
+def test_seeds_that_agree_have_an_interval_over_all_episodes(tmp_path):
+    make_run(tmp_path / "all", (100, 100, 100), env="B")
+    make_run(tmp_path / "most", (90, 90, 90), env="B")
+    most, all_ = read_results([tmp_path / "most", tmp_path / "all"])
+    assert all_.share.over == "episodes"
+    # Wilson 1927 for 300 of 300: 300 / (300 + 1.96**2).
+    assert (all_.share.low, all_.share.high) == pytest.approx((0.98736, 1.0), abs=1e-4)
+    middle, low, high = difference(most, all_)
+    assert middle == pytest.approx(0.1)
+    assert 0.05 < low < middle < high < 0.15
+
+
+def test_names_are_as_long_as_it_takes_to_tell_runs_apart(tmp_path):
+    folders = [tmp_path / name for name in ("a/seed-0", "b/seed-0", "c")]
+    for folder in folders:
+        folder.parent.mkdir(exist_ok=True)
+        make_run(folder, (90,), env="B")
+    results = read_results(folders)
+    assert [result.name for result in results] == ["a/seed-0", "b/seed-0", "c"]
+    with pytest.raises(ValueError, match="seed-0 is given twice"):
+        read_results([folders[0], tmp_path / "b" / ".." / "a" / "seed-0"])
 
 
 def test_one_seed_and_several_are_not_subtracted(runs):

@@ -14,7 +14,7 @@ from mjx_arm.envs.tasks.reach import Reach, ReachConfig
 from mjx_arm.options import Positive, options
 from mjx_arm.report.metrics import read_metrics
 from mjx_arm.tools.search_space import Dimension
-from mjx_arm.tools.sweep import describe_sweep, sweep
+from mjx_arm.tools.sweep import describe_sweep, import_optuna, sweep
 from mjx_arm.training.run_folder import load_config
 
 
@@ -97,6 +97,20 @@ def test_a_sweep_ranks_prunes_and_continues(tmp_path):
     assert describe_sweep(trials, SPACE).count("\n") == 6
     with pytest.raises(ValueError, match="holds a sweep with other options: give --out another"):
         sweep(CONFIG, (Dimension("n_step", 1, 2),), tmp_path / "sweep", trials=7)
+
+
+def test_a_trial_that_cannot_be_trained_is_pruned_and_one_that_was_cut_off_made_up_for(tmp_path):
+    space = (Dimension("replay_size", choices=(2**31 - 8, 2**31 - 4)),)
+    trials = sweep(CONFIG, space, tmp_path, trials=2)
+    assert [trial.state for trial in trials] == ["pruned", "pruned"]
+    # As a signal leaves a trial.
+    optuna = import_optuna()
+    journal = optuna.storages.journal.JournalFileBackend(str(tmp_path / "sweep.journal"))
+    storage = optuna.storages.JournalStorage(journal)
+    optuna.load_study(study_name="mjx_arm", storage=storage).ask()
+    trials = sweep(CONFIG, space, tmp_path, trials=3)
+    assert [trial.state for trial in trials] == ["pruned", "pruned", "fail", "pruned"]
+    assert (tmp_path / "sweep.html").read_text().count("pruned") >= 3
 
 
 @pytest.mark.parametrize(

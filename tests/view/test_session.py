@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -94,6 +95,19 @@ def test_a_push_moves_the_cube_and_nothing_else(session):
 def test_cameras_are_side_by_side(session):
     assert session.seen.image.shape == (16, 32, 3)
     assert (session.seen.image[:, :16] == session.seen.image[:, 16:]).all()
+
+
+def test_a_delayed_image_is_shown_as_the_agent_sees_it():
+    env = mjx_arm.make("A", physics="native", observation="rgb", size=(32, 32), image_delay=3)
+    session = Session(make_simulation(env), None, seed=3)
+    state = session.state
+    assert int(state.params["image_delay"][0]) > 0, "another seed, for an episode with a delay"
+    for _ in range(8):
+        state = session.simulation.advance(state, jnp.int32(3))[0]
+    seen = session.simulation.look(None, state).image
+    np.testing.assert_array_equal(seen, jax.jit(env.observe)(state))
+    now = env.render(state.physics.qpos, state.physics.poses, state.params)[0]
+    assert (seen != mjx_arm.rgb(now)).any()
 
 
 def test_actions_have_names(simulation):
