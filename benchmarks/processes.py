@@ -27,7 +27,6 @@ from machine import machine
 from throughput import time_chunks
 
 import mjx_arm
-from mjx_arm.algos import distill
 from mjx_arm.config import TrainConfig, set_train_options
 from mjx_arm.shard import Shard
 from mjx_arm.training.loop import make_trainer
@@ -59,6 +58,8 @@ Row = dict[str, Any]
 def config(*, tiny: bool) -> TrainConfig:
     """What all variants train."""
     options = {"env": "B", "learning_starts": 0, "student_starts": 0, "chunk_steps": 2_048}
+    # The student drives from the first step on, so that every part of a step is there.
+    options |= {"student_warm_up": 0}
     return set_train_options(mjx_arm.PRESETS["fast"], options | (_TINY if tiny else {}))
 
 
@@ -87,8 +88,6 @@ def measure(*, tiny: bool) -> dict[str, float]:
 
 
 def _rate(config: TrainConfig, mesh: jax.sharding.Mesh | None, *, tiny: bool) -> float:
-    # The student drives from the first step on, so that every part of a step is there.
-    distill._WARM_UP = 0
     trainer = make_trainer(config, mesh=mesh)
     state = [trainer.start()]
 

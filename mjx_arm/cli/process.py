@@ -88,5 +88,5 @@ def _stop(number: int, frame: FrameType | None) -> NoReturn:
     if os.isatty(1):
         os.write(1, b"\x1b[?25h")  # the cursor, which a progress bar hides
     with contextlib.suppress(OSError):  # the terminal may be gone
-        os.write(2, b"stopped; a run that has started continues with --resume and its folder\n")
+        os.write(2, b"stopped; a training that has begun continues with --resume and its folder\n")
     os._exit(128 + number)

@@ -294,7 +294,7 @@ class RunCheckpoints:
         self._origin = origin
 
     def save(self, vector_step: int, state: Any) -> None:
-        """Writes a checkpoint, then removes all but the last two.
+        """Writes a checkpoint, then removes all but the last two, and those that are not whole.
 
         Raises:
           ValueError: it could not be written.
@@ -303,6 +303,9 @@ class RunCheckpoints:
         if is_writer():
             for step in self.steps()[:-_KEPT]:
                 shutil.rmtree(self._path(step))
+            # What a process that was killed had begun to write.
+            for part in self.folder.glob("*.part"):
+                shutil.rmtree(part)
         # The next chunk, which does not wait for long, begins in all processes at once.
         wait_for_all()
 

@@ -74,7 +74,14 @@ from mjx_arm.training.loop import (
     summarise,
 )
 from mjx_arm.training.memory import check_memory, memory_plan, working_memory
-from mjx_arm.training.mesh import fetch, make_mesh, most_devices, place, shards_seeds
+from mjx_arm.training.mesh import (
+    check_division,
+    fetch,
+    make_mesh,
+    most_devices,
+    place,
+    shards_seeds,
+)
 from mjx_arm.training.objects import Objects, Record, check_record, only_here, record
 from mjx_arm.training.processes import (
     any_says,
@@ -465,7 +472,7 @@ def _prepare(
     parts = objects.given()
     if scene is not None and objects.env is None:
         parts["env"] = make_env(config.env, reward=parts.pop("reward", None), scene=scene)
-    mesh = make_mesh(_num_devices(config, objects, devices))
+    mesh = make_mesh(_num_devices(config, objects, devices, console))
     trainer = make_trainer(config, **parts, mesh=mesh)
     if mesh is not None:
         say_mesh(console, mesh.size, by_seed=shards_seeds(config, mesh.size))
@@ -475,12 +482,20 @@ def _prepare(
     return trainer
 
 
-def _num_devices(config: TrainConfig, objects: Objects, devices: int | None) -> int:
+def _num_devices(
+    config: TrainConfig, objects: Objects, devices: int | None, console: Console
+) -> int:
     """The number of local devices of a run: as asked for, or as many as divide its work."""
     check_value("devices", Count | None, devices)
     if devices is not None:
         return devices
     most = most_devices(config)
+    if most < jax.local_device_count():
+        try:
+            check_division(config, jax.local_device_count() * jax.process_count())
+        except ValueError as reason:
+            used = f"{most} of {jax.local_device_count()} devices are used"
+            console.print(f"{used}: {reason}", soft_wrap=True)
     total = most * jax.process_count()
     if objects.algorithm is not None and not shards_seeds(config, total):
         # An algorithm that knows nothing of other devices trains on one, as it always did.

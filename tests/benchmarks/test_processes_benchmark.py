@@ -53,6 +53,8 @@ def test_all_variants_train_the_same():
     config = processes.config(tiny=False)
     assert config.num_envs % 2 == config.algo.teacher_batch_size % 2 == 0
     assert config.algo.student_batch_size % 2 == 0
+    # From the first step on, or no image would be rendered in the loop.
+    assert config.algo.student_starts == config.algo.student_warm_up == 0
 
 
 @pytest.mark.long

@@ -24,6 +24,7 @@ import mjx_arm
 from mjx_arm.cli import main
 from mjx_arm.cli.parse import parse
 from mjx_arm.deploy.dynamixel import read_config
+from mjx_arm.presets import PRESETS
 from mjx_arm.training.agent import find_agent
 
 # What a training is shortened to. The last one of an option counts.
@@ -262,7 +263,13 @@ def test_job_scripts_name_options_that_there_are(script: pathlib.Path, folder: p
     for line in lines:
         words = shlex.split(line.replace('"$@"', ""))
         assert words[0] == ".venv/bin/mjx-arm"
-        parse([_VARIABLES.get(word, word) for word in words[1:]])
+        command, given = parse([_VARIABLES.get(word, word) for word in words[1:]])
+        if "preset" in given:
+            # Larger in proportion: the same work for each environment.
+            preset = PRESETS[command.preset]
+            assert command.options.samples_per_step == preset.samples_per_step
+            factor = command.options.num_envs // preset.num_envs
+            assert command.options.replay.replay_size == factor * preset.replay.replay_size
 
 
 @pytest.mark.slow

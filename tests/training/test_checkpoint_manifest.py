@@ -191,3 +191,11 @@ def test_an_option_that_is_newer_than_the_run_counts_as_its_default():
     assert config_differences(older, same) == ""
     other = dump_config(train_config(algorithm="distill", teacher_double=False))
     assert config_differences(older, other) == "teacher_double was True and is now False"
+
+
+def test_what_a_killed_process_had_begun_is_removed_by_the_next_save(tmp_path):
+    checkpoints = RunCheckpoints(tmp_path, ORIGIN)
+    begun = checkpoints.folder / "000000000007.part"
+    (begun / "state").mkdir(parents=True)
+    checkpoints.save(10, make_tree())
+    assert [path.name for path in checkpoints.folder.iterdir()] == ["000000000010"]

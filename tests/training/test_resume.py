@@ -44,7 +44,7 @@ OPTIONS = [
 ]
 TOTAL_STEPS = 8_000
 # Processes that are killed at a random moment each.
-KILLS = 10
+KILLS = 4
 
 
 def final_state(folder: pathlib.Path):

@@ -186,7 +186,7 @@ def test_a_signal_before_training_ends_the_process_at_once():
     process.send_signal(signal.SIGTERM)
     _, error = process.communicate(timeout=60)
     assert process.returncode == 128 + signal.SIGTERM
-    assert error == "stopped; a run that has started continues with --resume and its folder\n"
+    assert error == "stopped; a training that has begun continues with --resume and its folder\n"
 
 
 HOLDS = """

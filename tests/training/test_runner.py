@@ -23,6 +23,7 @@ from mjx_arm.training import runner
 from mjx_arm.training.checkpoint import RunCheckpoints
 from mjx_arm.training.evaluate import Evaluation, evaluate
 from mjx_arm.training.loop import make_trainer
+from mjx_arm.training.objects import Objects
 from mjx_arm.training.run_folder import load_run
 
 CONFIG = train_config(
@@ -388,3 +389,15 @@ def test_a_folder_in_use_is_rejected(plain):
 def test_config_is_frozen_while_it_trains(plain):
     with pytest.raises(dataclasses.FrozenInstanceError):
         load_run(plain).config.seed = 3
+
+
+def test_it_is_said_why_devices_are_left_out(monkeypatch):
+    monkeypatch.setattr(jax, "local_device_count", lambda: 3)
+    output = io.StringIO()
+    console = Console(file=output, width=200)
+    config = train_config(num_envs=64, batch_size=64)
+    assert runner._num_devices(config, Objects(), None, console) == 2
+    assert output.getvalue() == (
+        "2 of 3 devices are used: num_envs must be a multiple of the number of devices, 3, got 64\n"
+    )
+    assert runner._num_devices(config, Objects(), 1, console) == 1

@@ -101,6 +101,7 @@ def page(viewer):
         page.set_default_timeout(1000 * PATIENCE)
         page.asked, page.errors = [], []
         page.on("request", lambda request: page.asked.append(request.url))
+        page.on("websocket", lambda websocket: page.asked.append(websocket.url))
         page.on("pageerror", lambda error: page.errors.append(str(error)))
         page.goto(viewer.url)
         page.get_by_role("button", name="Pause", exact=True).wait_for()
