@@ -160,7 +160,7 @@ def ablations(plan: Plan) -> Iterator[Block]:
     for env in ("A", "B"):
         names = [None, *ABLATIONS] if env == "A" else _repeated(plan)
         yield from _ablation_table(plan, env, names)
-    if not strongest_ablations(plan.store):
+    if not strongest_ablations(plan.store, plan.cells):
         yield Missing(
             "The three strongest changes are tried again in B once all of A are measured.",
             plan.command("ablations", "ablations-B"),
@@ -173,7 +173,7 @@ def ablations(plan: Plan) -> Iterator[Block]:
 
 
 def _repeated(plan: Plan) -> list[Ablation | None]:
-    strongest = strongest_ablations(plan.store)
+    strongest = strongest_ablations(plan.store, plan.cells)
     return [None, *(each for each in ABLATIONS if each.name in strongest)] if strongest else []
 
 
