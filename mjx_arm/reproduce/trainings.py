@@ -228,7 +228,8 @@ ABLATIONS = (
     Ablation("gamma", "γ = 0.98 instead of 0.99", {"gamma": 0.98}),
     Ablation("size", "images of 32×32 pixels instead of 64×64", {"size": (32, 32)}),
     Ablation("environments", "16 environments instead of 64, batches in proportion", {
-        "num_envs": 16, "teacher_batch_size": 128, "student_updates_per_step": 1,
+        "num_envs": 16, "teacher_batch_size": 128, "student_batch_size": 48,
+        "student_updates_per_step": 1,
     }),
     Ablation("normalisation", "no LayerNorm, in both networks", {
         "layer_norm": False, "teacher_layer_norm": False,

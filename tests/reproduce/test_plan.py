@@ -133,6 +133,20 @@ def test_the_strongest_changes_of_a_quick_run_are_not_those_of_the_study(tmp_pat
     assert not any(training.name.startswith("ablation-B") for training in plan.trainings)
 
 
+def test_fewer_environments_sample_as_much_for_each_step():
+    samples = []
+    for name in ("default", "environments"):
+        config = ablation_training(name, "A").config
+        algo = config.algo
+        samples.append(
+            (
+                algo.teacher_batch_size * algo.teacher_updates_per_step / config.num_envs,
+                algo.student_batch_size * algo.student_updates_per_step / config.num_envs,
+            )
+        )
+    assert samples == [(8.0, 3.0)] * 2
+
+
 def save_finished(training: Training, folder) -> None:
     """The files by which a finished run is known."""
     folder.mkdir(parents=True)
