@@ -19,7 +19,8 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from mjx_arm.algos.exploration import check_epsilon, epsilon_greedy
-from mjx_arm.envs.env import Env
+from mjx_arm.envs.env import Env, make_env
+from mjx_arm.envs.randomisation import RandomisationConfig
 from mjx_arm.export import export_policy
 from mjx_arm.options import Count, check_value
 from mjx_arm.physics import compiler_options
@@ -155,6 +156,9 @@ def start_keys(seed: int, episodes: int) -> jax.Array:
 def sample_starts(env: Env, seed: int, episodes: int) -> list[Start]:
     """Starts that neither training nor the selection of an agent has seen.
 
+    They are those of the environment without randomisation: the stand-in's cube has the size that
+    the scene says.
+
     Args:
       env: the environment.
       seed: of the starts.
@@ -167,6 +171,9 @@ def sample_starts(env: Env, seed: int, episodes: int) -> list[Start]:
 @functools.lru_cache(maxsize=4)
 def _starter(env: Env) -> Callable[[jax.Array], tuple[jax.Array, jax.Array]]:
     """`keys [N] -> qpos [N, nq], ctrl [N, nu]` of starts, compiled once for an environment."""
+    if env.randomiser:
+        config = dataclasses.replace(env.config, randomise=RandomisationConfig())
+        env = make_env(config, reward=env.reward, scene=env.scene)
 
     def start(key: jax.Array) -> tuple[jax.Array, jax.Array]:
         _, state = env.reset(key)
@@ -217,6 +224,9 @@ def in_simulation(
     agent: Agent, seed: int, episodes: int, *, epsilon: float = 0.1, iterations: int = ITERATIONS
 ) -> list[Trace]:
     """Runs an agent in its simulator, from the starts that `sample_starts` gives for the seed.
+
+    An agent that was trained with randomisation is tried with it. Where the cube's size varies, the
+    starts differ by what that changes: the height of the cube, or how far the gripper is closed.
 
     Args:
       agent: with the task `lift`.
