@@ -147,6 +147,14 @@ def _dropped(trace: Trace) -> bool:
     return bool((lost & (trace.height[:-1] >= _LIFTED)).any())
 
 
+def without_randomisation(env: Env) -> Env:
+    """The same environment in which nothing varies but what its task varies."""
+    if not env.randomiser:
+        return env
+    config = dataclasses.replace(env.config, randomise=RandomisationConfig())
+    return make_env(config, reward=env.reward, scene=env.scene)
+
+
 def start_keys(seed: int, episodes: int) -> jax.Array:
     """Keys `[episodes]` of starts that neither training nor the selection of an agent has seen."""
     start_key, _ = jax.random.split(role_key(seed, EVALUATION))
@@ -171,9 +179,7 @@ def sample_starts(env: Env, seed: int, episodes: int) -> list[Start]:
 @functools.lru_cache(maxsize=4)
 def _starter(env: Env) -> Callable[[jax.Array], tuple[jax.Array, jax.Array]]:
     """`keys [N] -> qpos [N, nq], ctrl [N, nu]` of starts, compiled once for an environment."""
-    if env.randomiser:
-        config = dataclasses.replace(env.config, randomise=RandomisationConfig())
-        env = make_env(config, reward=env.reward, scene=env.scene)
+    env = without_randomisation(env)
 
     def start(key: jax.Array) -> tuple[jax.Array, jax.Array]:
         _, state = env.reset(key)
