@@ -379,7 +379,11 @@ def _reward_cell(training: Training, run: pathlib.Path, quick: bool) -> Cell:
         name,
         "reward",
         lambda: measure_reward(name, run, trial),
-        lambda: {"config": dump_config(training.config), **dataclasses.asdict(trial)},
+        lambda: {
+            "config": dump_config(training.config),
+            "agent": LAST,
+            **dataclasses.asdict(trial),
+        },
         training,
     )
 
@@ -393,6 +397,7 @@ def _paper_cell(training: Training, run: pathlib.Path, quick: bool) -> Cell:
         lambda: measure_paper(name, run, trials),
         lambda: {
             "config": dump_config(training.config),
+            "agent": LAST,
             "trials": {label: dataclasses.asdict(trial) for label, trial in trials.items()},
         },
         training,

@@ -66,8 +66,8 @@ def _reward_figures(found: dict[str, list[Measured]]) -> Iterator[Block]:
         tuple(rows),
     )  # fmt: skip
     yield Text(
-        "Hovering: the cube is grasped and more than 20 cm high in an episode that fails. The best "
-        "agent of each run, one action in ten random."
+        "Hovering: the cube is grasped and more than 20 cm high in an episode that fails. The last "
+        "agent of each run is judged, not the best one, with one action in ten random."
     )
     labels = {name: REWARDS[name][1].partition(":")[0].replace("`", "") for name in found}
     curves = {labels[name]: [x.result["curve"] for x in cells] for name, cells in found.items()}
@@ -116,7 +116,7 @@ def paper(plan: Plan) -> Iterator[Block]:
     yield Heading("The preset `paper`")
     yield Text(
         "Every value that the paper states, in environment A, for 1,000,000 iterations: its "
-        "schedule of ε ends there. No success is selected for; what came out is reported as it is."
+        "schedule of ε ends there. The last agent is judged, not the best one."
     )
     found = plan.read("paper-A")
     if found is None:

@@ -7,14 +7,15 @@ import json
 import pytest
 from made_runs import make_run
 
-from mjx_arm.reproduce import command
+from mjx_arm.reproduce import command, studies
 from mjx_arm.reproduce.curves import read_curve
 from mjx_arm.reproduce.page import page_blocks, write_pages
 from mjx_arm.reproduce.plan import make_plan
 from mjx_arm.reproduce.records import CAUSES, HEIGHT_EDGES
 from mjx_arm.reproduce.store import Measured
-from mjx_arm.reproduce.studies import measure_ablation
+from mjx_arm.reproduce.studies import measure_ablation, measure_paper, measure_reward
 from mjx_arm.reproduce.trainings import ABLATIONS
+from mjx_arm.reproduce.trials import Trial
 from mjx_arm.training.evaluate import wilson_interval
 
 
@@ -109,6 +110,19 @@ def test_the_preset_paper_is_reported_both_ways(tmp_path, run):
     text = text_of(plan)
     assert "| ε = 0.1 | 2.0 % |" in text
     assert "| greedy | 0.0 % |" in text
+
+
+def test_the_last_agent_of_a_study_is_judged(run, monkeypatch):
+    judged = []
+
+    def measure(name, path, trial, pictures):
+        judged.append(path)
+        return {"episodes_each": {}}, {}
+
+    monkeypatch.setattr(studies, "measure_episodes", measure)
+    measure_reward("reward", run, Trial("A", 1))
+    measure_paper("paper", run, {"greedy": Trial("A", 1)})
+    assert judged == [str(run / "last.safetensors")] * 2
 
 
 def test_each_change_has_its_difference_and_a_sentence(tmp_path, run):
