@@ -12,7 +12,7 @@ from mjx_arm.options import flat_names, get_option
 from mjx_arm.presets import PRESETS
 from mjx_arm.report import html
 from mjx_arm.report.run_page import duration, show_option
-from mjx_arm.reproduce import agent_sections, study_sections
+from mjx_arm.reproduce import agent_sections, standin_sections, study_sections
 from mjx_arm.reproduce.blocks import (
     Block,
     Command,
@@ -66,7 +66,8 @@ def page_blocks(plan: Plan) -> Iterator[Block]:
         study_sections.paper,
         study_sections.ablations,
         agent_sections.failures,
-        study_sections.transfer,
+        standin_sections.figure5,
+        standin_sections.transfer,
     ):
         yield from section(plan)
     yield from _configurations(plan)

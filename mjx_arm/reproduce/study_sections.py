@@ -1,9 +1,7 @@
-"""The parts of the page about studies: the reward, the preset `paper`, ablations, transfer."""
+"""The parts of the page about studies: the reward, the preset `paper`, ablations."""
 
 from __future__ import annotations
 
-import json
-import shlex
 from collections.abc import Iterator
 from typing import Any
 
@@ -12,7 +10,7 @@ from mjx_arm.reproduce.agent_sections import missing_cells
 from mjx_arm.reproduce.blocks import Block, Heading, Missing, Picture, Source, Table, Text
 from mjx_arm.reproduce.plan import Plan, strongest_ablations
 from mjx_arm.reproduce.plots import draw_effects, draw_heights, draw_study
-from mjx_arm.reproduce.store import CELLS, Measured
+from mjx_arm.reproduce.store import Measured
 from mjx_arm.reproduce.trainings import ABLATION_MINUTES, ABLATIONS, DEFAULT, REWARDS, Ablation
 from mjx_arm.tools.compare import share_of
 from mjx_arm.training.evaluate import newcombe_interval
@@ -243,39 +241,3 @@ def _verdict(change: tuple[float, float, float] | None) -> str:
     if low > 0:
         return "Better than the default in this seed."
     return "No clear difference."
-
-
-def transfer(plan: Plan) -> Iterator[Block]:
-    """Figure 5 and the transfer to another world."""
-    yield Heading("Figure 5 and the transfer to another world")
-    rows, files, missing = [], [], []
-    for level in ("near", "medium", "far"):
-        file = f"{CELLS}/transfer-{level}.json"
-        path = plan.store.folder / file
-        if not path.is_file():
-            missing.append(level)
-            continue
-        try:
-            values = json.loads(path.read_text(encoding="utf-8"))
-            rows.append((level, percent(values["rate"]), interval(*values["ci95"])))
-            files.append(file)
-        except (ValueError, KeyError, TypeError):
-            # It is damaged, or the command was interrupted.
-            missing.append(level)
-    if rows:
-        yield Table(("level", "success", "95 % interval"), tuple(rows))
-        yield Source(tuple(files))
-    if missing:
-        folder = plan.store.folder / CELLS
-        yield Missing(
-            f"Success in the stand-in for reality at {', '.join(missing)}. Not measured yet.",
-            "\n".join(
-                f"mjx-arm transfer AGENT --level {level} --episodes 200 --json "
-                f"> {shlex.quote(f'{folder}/transfer-{level}.json')}"
-                for level in missing
-            ),
-        )
-    yield Text(
-        "Figure 5, the feature maps of each layer in simulation and in the stand-in, is not on "
-        "this page. `python benchmarks/feature_maps.py AGENT --out FOLDER` makes it."
-    )

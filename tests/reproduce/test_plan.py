@@ -205,13 +205,15 @@ def test_a_page_without_any_cell_names_every_command(tmp_path, capsys):
     for part in (
         *("figure1-arm_cube", "figure2-taught-A-seed0", "episodes-taught-B-seed0-in-A"),
         *("figure4-taught-B-seed0", "reward-published-seed0", "paper-A", "ablation-A-gamma"),
-        "mjx-arm transfer AGENT --level near",
+        "python benchmarks/transfer.py taught-A-seed0=agent-a taught-B-seed0=agent-b --levels near",
+        "python benchmarks/feature_maps.py taught-A-seed0=agent-a taught-B-seed0=agent-b --page",
     ):
         assert part in page
     assert "http" not in page.replace("http-equiv", "")
     text = (out / "index.md").read_text()
     assert f"\nmjx-arm reproduce --shipped --out '{out}'\n" in text
-    assert f"> '{out}/cells/transfer-near.json'" in text
+    assert f" --levels near medium far --out '{out}/cells'\n" in text
+    assert f" --page '{out}'\n" in text
 
 
 def test_options_of_a_cell_that_changed_make_it_missing(tmp_path):

@@ -9,7 +9,7 @@ from made_runs import make_run
 
 from mjx_arm.reproduce import command, studies
 from mjx_arm.reproduce.curves import read_curve
-from mjx_arm.reproduce.page import page_blocks, write_pages
+from mjx_arm.reproduce.page import write_pages
 from mjx_arm.reproduce.plan import make_plan
 from mjx_arm.reproduce.records import CAUSES, HEIGHT_EDGES
 from mjx_arm.reproduce.store import Measured
@@ -154,14 +154,3 @@ def test_the_last_change_in_a_puts_the_changes_in_b_on_the_same_page(tmp_path, r
     )
     page = command.reproduce(tmp_path / "page", shipped=True, only=("ablations",))
     assert "Not measured yet: `ablation-B-default`" in page.with_name("index.md").read_text()
-
-
-def test_transfer_is_shown_when_its_files_are_there(tmp_path):
-    plan = plan_of(tmp_path / "page")
-    plan.store.prepare()
-    path = plan.store.folder / "cells" / "transfer-near.json"
-    path.write_text(json.dumps({"rate": 0.8, "ci95": [0.7, 0.9]}))
-    text = text_of(plan)
-    assert "| near | 80.0 % | 70.0 to 90.0 |" in text
-    assert "at medium, far" in text
-    assert list(page_blocks(plan))
