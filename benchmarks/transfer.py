@@ -8,7 +8,8 @@ AGENT alone.
 
 Files in FOLDER: `cell-NAME-WORLD-START.json`, one for each cell; and `transfer.json` with all cells
 as `cells`, and every reading of a true level (near, medium, far) as `readings`. An agent is read at
-true levels three times at most, so that nothing is tuned on them.
+true levels three times at most, so that nothing is tuned on them. If FOLDER is `cells` in that of
+`mjx-arm reproduce`, its page shows the table.
 """
 
 from __future__ import annotations
@@ -78,14 +79,23 @@ def write_table(folder: pathlib.Path, table: dict[str, Any]) -> None:
 
 
 def add_cell(folder: pathlib.Path, cell: dict[str, Any]) -> None:
-    """Writes a cell, in the place of an older one of the same agent, world and start."""
+    """Writes a cell, in the place of an older one of the same agent, world and start.
+
+    Cells of another agent that had the same name are removed.
+    """
     names = ("agent", "world", "start")
     table = read_table(folder)
     others = [x for x in table["cells"] if [x[n] for n in names] != [cell[n] for n in names]]
-    table["cells"] = [*others, cell]
+    same = [x for x in others if x["agent"] != cell["agent"] or x.get("sha256") == cell["sha256"]]
+    for gone in (x for x in others if x not in same):
+        _cell_path(folder, gone).unlink(missing_ok=True)
+    table["cells"] = [*same, cell]
     write_table(folder, table)
-    path = folder / f"cell-{'-'.join(cell[name] for name in names)}.json"
-    path.write_text(json.dumps({"machine": machine(), **cell}, indent=1) + "\n")
+    _cell_path(folder, cell).write_text(json.dumps({"machine": machine(), **cell}, indent=1) + "\n")
+
+
+def _cell_path(folder: pathlib.Path, cell: dict[str, Any]) -> pathlib.Path:
+    return folder / f"cell-{cell['agent']}-{cell['world']}-{cell['start']}.json"
 
 
 def measure(agent: str, world: str, start: str, options: argparse.Namespace) -> Outcomes:
@@ -127,7 +137,8 @@ def main() -> None:
             for start in options.starts:
                 began = time.monotonic()
                 outcomes = measure(agent, world, start, options)
-                cell = {"agent": name, "world": world, "start": start, "epsilon": EPSILON}
+                cell = {"agent": name, "sha256": digest(agent), "world": world, "start": start}
+                cell["epsilon"] = EPSILON
                 cell |= {"seed": SEED, **dataclasses.asdict(outcomes)}
                 cell["seconds"] = round(time.monotonic() - began, 1)
                 print(json.dumps(cell), flush=True)

@@ -41,7 +41,8 @@ class StandInOptions:
 
     Attributes:
       agent: an agent's file, or a run folder, of which the best agent is taken.
-      level: how far the stand-in is from the simulator: `near`, `medium`, `far`, or `test`.
+      level: how far the stand-in is from the simulator: `test`, or one of `near`, `medium` and
+        `far`, at which an agent is judged three times at most.
       env: environment, `A` or `B`; by default the one it was trained in.
       start: `home`, or `in_grasp` with the cube in the closed gripper.
       epsilon: share of random actions.
@@ -51,7 +52,7 @@ class StandInOptions:
     """
 
     agent: tyro.conf.Positional[pathlib.Path]
-    level: str = "near"
+    level: str = "test"
     env: str | None = None
     start: str = "home"
     epsilon: float = 0.1

@@ -203,10 +203,10 @@ def table1(plan: Plan) -> Iterator[Block]:
             found = _of_seeds(plan, way, trained, tried)
             if found:
                 rows.append(_row(way, trained, tried, found))
-                files += [each.file for each in found]
+                files += [each.file for _, each in found]
     head = (
         *("training", "trained in", "tried in", "episodes", "success", "95 % interval"),
-        *("worst seed", "first 50 episodes", "held, not lifted"),
+        *("worst seed", "first 50 episodes of one seed", "held, not lifted"),
     )
     yield Table(head, tuple(rows))
     yield Text(
@@ -231,12 +231,13 @@ def table1(plan: Plan) -> Iterator[Block]:
             )
 
 
-def _of_seeds(plan: Plan, way: str, trained: str, tried: str) -> list[Measured]:
+def _of_seeds(plan: Plan, way: str, trained: str, tried: str) -> list[tuple[int, Measured]]:
+    """The seeds of a way of training with the episodes of each."""
     found = []
     for subject in plan.subjects:
         if subject.key[:2] == (way, trained):
             each = plan.read(f"episodes-{subject.name}-in-{tried}")
-            found += [] if each is None else [each]
+            found += [] if each is None else [(subject.seed, each)]
     return found
 
 
@@ -248,14 +249,14 @@ def _paper_row(trained: str, tried: str, successes: int) -> tuple[str, ...]:
     return ("James & Johns 2016", trained, tried, str(count), rate, bounds, "–", fifty, "–")
 
 
-def _row(way: str, trained: str, tried: str, found: list[Measured]) -> tuple[str, ...]:
-    results = [each.result for each in found]
+def _row(way: str, trained: str, tried: str, found: list[tuple[int, Measured]]) -> tuple[str, ...]:
+    results = [each.result for _, each in found]
     counts = [(x["successes"], x["episodes"]) for x in results]
     share = share_of(counts)
     assert share is not None
     worst = percent(min(s / n for s, n in counts)) if len(counts) > 1 else "one seed"
     held = sum(x["held_not_lifted"] for x in results) / sum(n for _, n in counts)
-    first = results[0]
+    seed, first = found[0][0], results[0]
     return (
         WAYS[way],
         trained,
@@ -264,12 +265,12 @@ def _row(way: str, trained: str, tried: str, found: list[Measured]) -> tuple[str
         percent(share.rate),
         f"{interval(share.low, share.high)}, {share.over}",
         worst,
-        f"{first['first_successes']} of {first['first_episodes']}",
+        f"{first['first_successes']} of {first['first_episodes']}, seed {seed}",
         percent(held),
     )
 
 
-def _firsts(plan: Plan) -> Iterator[Subject]:
+def firsts(plan: Plan) -> Iterator[Subject]:
     """The first seed of each way of training in each environment."""
     seen = set()
     for subject in plan.subjects:
@@ -281,7 +282,7 @@ def _firsts(plan: Plan) -> Iterator[Subject]:
 def figure4(plan: Plan) -> Iterator[Block]:
     """Q-values along one successful greedy episode."""
     yield Heading("Figure 4: Q-values along one episode")
-    for subject in _firsts(plan):
+    for subject in firsts(plan):
         found = plan.read(f"figure4-{subject.name}")
         if found is not None:
             yield Heading(f"{subject.name}, in environment {subject.trained_in}", 3)
@@ -332,7 +333,7 @@ def regrasping(plan: Plan) -> Iterator[Block]:
         "are the random opens while the cube was grasped, where the agent itself preferred another "
         "action."
     )
-    for subject in _firsts(plan):
+    for subject in firsts(plan):
         found = plan.read(f"episodes-{subject.name}-in-{subject.trained_in}")
         if found is None:
             continue
@@ -371,13 +372,13 @@ def _of(row: dict[str, int], total: int) -> tuple[str, str, str, str]:
 
 
 def _own(plan: Plan) -> list[str]:
-    return [f"episodes-{x.name}-in-{x.trained_in}" for x in _firsts(plan)]
+    return [f"episodes-{x.name}-in-{x.trained_in}" for x in firsts(plan)]
 
 
 def failures(plan: Plan) -> Iterator[Block]:
     """Failed episodes by cause, and success by the start."""
     yield Heading("Where it fails")
-    subjects = [subject for subject in _firsts(plan) if subject.trained_in == "B"]
+    subjects = [subject for subject in firsts(plan) if subject.trained_in == "B"]
     for subject in subjects:
         found = plan.read(f"episodes-{subject.name}-in-B")
         if found is not None:

@@ -5,19 +5,21 @@ from __future__ import annotations
 import json
 import pathlib
 from collections.abc import Iterator
+from typing import Any
 
 from mjx_arm.config import dump_config, parse_config
 from mjx_arm.options import flat_names, get_option
 from mjx_arm.presets import PRESETS
 from mjx_arm.report import html
 from mjx_arm.report.run_page import duration, show_option
-from mjx_arm.reproduce import agent_sections, study_sections
+from mjx_arm.reproduce import agent_sections, standin_sections, study_sections
 from mjx_arm.reproduce.blocks import (
     Block,
     Command,
     Fold,
     Heading,
     Picture,
+    Source,
     Table,
     Text,
     to_html,
@@ -64,7 +66,8 @@ def page_blocks(plan: Plan) -> Iterator[Block]:
         study_sections.paper,
         study_sections.ablations,
         agent_sections.failures,
-        study_sections.transfer,
+        standin_sections.figure5,
+        standin_sections.transfer,
     ):
         yield from section(plan)
     yield from _configurations(plan)
@@ -84,12 +87,13 @@ def _head(plan: Plan) -> Iterator[Block]:
             "This is a quick run: its episodes are few and short, and what it trains is tiny. It "
             "proves that the commands work; its figures are too uncertain to be quoted."
         )
-    rows = []
+    rows, files = [], []
     for subject in plan.subjects:
         steps = "–"
         found = plan.read(f"episodes-{subject.name}-in-{subject.trained_in}")
         if found is not None:
             steps = f"{found.result['env_steps']:,}"
+            files.append(found.file)
         where = "only its curve" if subject.agent is None else f"`{subject.agent}`"
         rows.append(
             (subject.name, WAYS[subject.way], subject.trained_in, str(subject.seed), steps, where)
@@ -98,6 +102,8 @@ def _head(plan: Plan) -> Iterator[Block]:
         yield Heading("The agents")
         head = ("name", "training", "trained in", "seed", "steps", "where it is from")
         yield Table(head, tuple(rows))
+        if files:
+            yield Source(tuple(files))
     else:
         yield Text("There is no agent yet.")
     yield Text("The whole page is made by these commands; each says the hours before it trains:")
@@ -140,19 +146,22 @@ def _configurations(plan: Plan) -> Iterator[Block]:
 def _times(plan: Plan) -> Iterator[Block]:
     yield Heading("Machine, versions and times")
     cells = _cells(plan)
-    machines = {json.dumps(cell.machine, sort_keys=True): cell.machine for cell in cells}
-    for values in machines.values():
-        found = ", ".join(f"{name} {x}" for name, x in values["versions"].items())
-        flags = f" XLA_FLAGS: {values['xla_flags']}." if values["xla_flags"] else ""
-        yield Text(
-            f"Measured on {values['cpu']}, {values['cores']} cores, device {values['device']}, "
-            f"Python {values['python']}. {found}.{flags}"
-        )
+    # Machines may differ in what is not printed.
+    yield from map(Text, dict.fromkeys(_describe(cell.machine) for cell in cells))
     rows = [
         (f"`{cell.file}`", duration(cell.seconds), _training_time(cell), cell.date)
         for cell in cells
     ]
     yield Table(("file", "measuring", "training", "written"), tuple(rows))
+
+
+def _describe(machine: dict[str, Any]) -> str:
+    found = ", ".join(f"{name} {x}" for name, x in machine["versions"].items())
+    flags = f" XLA_FLAGS: {machine['xla_flags']}." if machine["xla_flags"] else ""
+    return (
+        f"Measured on {machine['cpu']}, {machine['cores']} cores, device {machine['device']}, "
+        f"Python {machine['python']}. {found}.{flags}"
+    )
 
 
 def _training_time(cell: Measured) -> str:

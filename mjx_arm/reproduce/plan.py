@@ -7,7 +7,7 @@ import hashlib
 import json
 import pathlib
 import shlex
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
 from mjx_arm.config import dump_config
@@ -26,6 +26,7 @@ from mjx_arm.reproduce.trainings import (
     ablation_training,
     agent_trainings,
     is_finished,
+    is_same,
     paper_training,
     reward_trainings,
     shorten,
@@ -40,6 +41,7 @@ from mjx_arm.reproduce.trials import (
 )
 from mjx_arm.scene import read_source, scene_exists
 from mjx_arm.training.agent import BEST, LAST
+from mjx_arm.training.run_folder import CONFIG
 
 # Parts of the page. Those in `_BY_DEFAULT` are made by default, the others must be asked for.
 SECTIONS = {
@@ -80,6 +82,22 @@ class Cell:
     measure: Callable[[], Result]
     inputs: Callable[[], dict[str, Any]]
     training: Training | None = None
+
+
+def read_cell(store: Store, cell: Cell) -> Measured | None:
+    """The file of a cell; None if there is none of the cell's own inputs.
+
+    Raises:
+      ValueError: the file is damaged.
+    """
+    found = store.read(cell.name)
+    if found is None:
+        return None
+    try:
+        wanted = json.loads(json.dumps(cell.inputs()))
+    except ValueError:
+        return None
+    return found if found.inputs == wanted else None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -123,17 +141,7 @@ class Plan:
         Raises:
           ValueError: the file is damaged.
         """
-        found = self.store.read(name)
-        if found is None:
-            return None
-        for cell in self.cells:
-            if cell.name == name:
-                try:
-                    wanted = json.loads(json.dumps(cell.inputs()))
-                except ValueError:
-                    return None
-                return found if found.inputs == wanted else None
-        return None
+        return next((read_cell(self.store, cell) for cell in self.cells if cell.name == name), None)
 
     def wanted_trainings(self) -> list[Training]:
         """The trainings that the chosen cells need and that are not finished."""
@@ -183,15 +191,15 @@ def make_plan(
     check_value("seeds", Count, seeds)
     store = Store(out)
     options = _options(out, runs=runs, shipped=shipped, quick=quick, seeds=seeds)
-    adapt = shorten if quick else _same
-    made_here = [adapt(each) for section in AGENTS for each in agent_trainings(section, seeds)]
+    made_here = [each for section in AGENTS for each in agent_trainings(section, seeds)]
+    made_here = _adapt(made_here, quick)
     trains = runs is None and not shipped
     subjects = merge(
         [] if runs is None else find_runs(runs),
         find_shipped() if shipped else [],
     )
     subjects = _with_own(subjects, store, made_here, trains)
-    trainings = [*made_here, *map(adapt, _study_trainings(store, quick))]
+    trainings = [*made_here, *_study_trainings(store, quick)]
     cells = [*_agent_cells(subjects, quick), *_study_cells(store, trainings, quick)]
     names = [*SECTIONS, *(cell.name for cell in cells)]
     for name in only:
@@ -206,8 +214,8 @@ def make_plan(
     )
 
 
-def _same(training: Training) -> Training:
-    return training
+def _adapt(trainings: Sequence[Training], quick: bool) -> list[Training]:
+    return [shorten(training) for training in trainings] if quick else list(trainings)
 
 
 def _options(
@@ -232,6 +240,9 @@ def _with_own(
         folder = store.folder / RUNS / training.name
         there = any((folder / name).is_file() for name in (BEST, LAST))
         if (way, env) in found or not (there or (trains and training.name.startswith("agent-"))):
+            continue
+        # Another run is there, such as one of `--quick`: its agent is not the one that is shown.
+        if (folder / CONFIG).is_file() and not is_same(training, folder):
             continue
         own.append(Subject(way, env, training.config.seed, training.config, str(folder), folder))
     return [*subjects, *own]
@@ -324,24 +335,29 @@ def _study_trainings(store: Store, quick: bool) -> list[Training]:
     if quick:
         rewards = [each for each in rewards if each.config.seed == 0]
     names = [DEFAULT, *(each.name for each in ABLATIONS if each.changes is not None)]
-    in_a = [ablation_training(name, "A") for name in names]
-    strongest = strongest_ablations(store)
+    in_a = _adapt([ablation_training(name, "A") for name in names], quick)
+    strongest = strongest_ablations(store, _study_cells(store, in_a, quick))
     in_b = [ablation_training(name, "B") for name in (DEFAULT, *strongest)] if strongest else []
-    return [*rewards, paper_training(), *in_a, *in_b]
+    return [*_adapt([*rewards, paper_training()], quick), *in_a, *_adapt(in_b, quick)]
 
 
-def strongest_ablations(store: Store) -> list[str]:
-    """Names of the three changes with the largest effect in A; empty before all are measured."""
-    found = {}
-    for ablation in ABLATIONS:
-        if ablation.changes is not None:
-            found[ablation.name] = store.read(f"ablation-A-{ablation.name}")
-    default = store.read(f"ablation-A-{DEFAULT}")
-    if default is None or any(x is None for x in found.values()):
+def strongest_ablations(store: Store, cells: Iterable[Cell]) -> list[str]:
+    """Names of the three changes with the largest effect in A; empty before all are measured.
+
+    Args:
+      store: of the page.
+      cells: of a plan; files of other options do not count.
+    """
+    found = {
+        cell.name.removeprefix("ablation-A-"): read_cell(store, cell)
+        for cell in cells
+        if cell.section == "ablations"
+    }
+    rates = {name: each.result["rate"] for name, each in found.items() if each is not None}
+    if not found or len(rates) < len(found):
         return []
-    rate = default.result["rate"]
-    effects = {name: abs(x.result["rate"] - rate) for name, x in found.items() if x is not None}
-    return sorted(effects, key=lambda name: (-effects[name], name))[:STRONGEST]
+    default = rates.pop(DEFAULT)
+    return sorted(rates, key=lambda name: (-abs(rates[name] - default), name))[:STRONGEST]
 
 
 def _study_cells(store: Store, trainings: Sequence[Training], quick: bool) -> Iterator[Cell]:
@@ -363,7 +379,11 @@ def _reward_cell(training: Training, run: pathlib.Path, quick: bool) -> Cell:
         name,
         "reward",
         lambda: measure_reward(name, run, trial),
-        lambda: {"config": dump_config(training.config), **dataclasses.asdict(trial)},
+        lambda: {
+            "config": dump_config(training.config),
+            "agent": LAST,
+            **dataclasses.asdict(trial),
+        },
         training,
     )
 
@@ -377,6 +397,7 @@ def _paper_cell(training: Training, run: pathlib.Path, quick: bool) -> Cell:
         lambda: measure_paper(name, run, trials),
         lambda: {
             "config": dump_config(training.config),
+            "agent": LAST,
             "trials": {label: dataclasses.asdict(trial) for label, trial in trials.items()},
         },
         training,

@@ -81,6 +81,28 @@ class Store:
         complete = all((self.folder / PICTURES / each).is_file() for each in found.pictures)
         return found if complete else None
 
+    def read_report(self, name: str) -> dict[str, Any] | None:
+        """The JSON object that a benchmark has left among the cells; None if there is none.
+
+        Raises:
+          ValueError: the file is damaged.
+        """
+        path = self.folder / CELLS / f"{name}.json"
+        if not path.is_file():
+            return None
+        try:
+            values = json.loads(path.read_text(encoding="utf-8"))
+        except ValueError:
+            values = None
+        if not isinstance(values, dict):
+            raise self.damaged(name)
+        return values
+
+    def damaged(self, name: str) -> ValueError:
+        """The error of a file among the cells that cannot be read."""
+        path = self.folder / CELLS / f"{name}.json"
+        return ValueError(f"{path} is damaged: remove it, and measure it again")
+
     def write(self, measured: Measured, pictures: Mapping[str, bytes]) -> None:
         """Writes a cell: its pictures first, so that where its file is they are there too.
 

@@ -9,6 +9,7 @@ from mjx_arm.envs.env import make_env
 from mjx_arm.report.run_page import read_evaluation
 from mjx_arm.reproduce.curves import read_curve
 from mjx_arm.reproduce.trials import Result, Trial, measure_episodes
+from mjx_arm.training.agent import LAST
 from mjx_arm.training.run_folder import load_config
 
 # Of an evaluation, what the page has a use for.
@@ -16,7 +17,7 @@ _OF_EVALUATION = ("episodes", "successes", "rate", "ci95", "mean_length", "metri
 
 
 def measure_reward(name: str, run: pathlib.Path, trial: Trial) -> Result:
-    """A run of the reward study: its curve, its success, and where its policy holds the cube.
+    """A run of the reward study: its curve, and of its last agent the success and the heights.
 
     Args:
       name: of the cell.
@@ -28,7 +29,7 @@ def measure_reward(name: str, run: pathlib.Path, trial: Trial) -> Result:
       run's discount: the calculation that the study checks.
     """
     config = load_config(run)
-    result, _ = measure_episodes(name, str(run), trial, pictures=False)
+    result, _ = measure_episodes(name, str(run / LAST), trial, pictures=False)
     # Starts are of no interest here, and are most of the file.
     result.pop("episodes_each")
     env = make_env(config.env)
@@ -59,11 +60,11 @@ def measure_reward(name: str, run: pathlib.Path, trial: Trial) -> Result:
 
 
 def measure_paper(name: str, run: pathlib.Path, trials: dict[str, Trial]) -> Result:
-    """The preset `paper`: its curve, and its success under each of several trials."""
+    """The preset `paper`: its curve, and the success of its last agent under several trials."""
     config = load_config(run)
     result: dict[str, Any] = {"curve": read_curve(run, config.env.reward_scale), "trials": {}}
     for label, trial in trials.items():
-        found, _ = measure_episodes(name, str(run), trial, pictures=False)
+        found, _ = measure_episodes(name, str(run / LAST), trial, pictures=False)
         found.pop("episodes_each")
         result["trials"][label] = found
     return result, {}

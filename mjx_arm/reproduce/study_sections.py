@@ -1,9 +1,7 @@
-"""The parts of the page about studies: the reward, the preset `paper`, ablations, transfer."""
+"""The parts of the page about studies: the reward, the preset `paper`, ablations."""
 
 from __future__ import annotations
 
-import json
-import shlex
 from collections.abc import Iterator
 from typing import Any
 
@@ -12,7 +10,7 @@ from mjx_arm.reproduce.agent_sections import missing_cells
 from mjx_arm.reproduce.blocks import Block, Heading, Missing, Picture, Source, Table, Text
 from mjx_arm.reproduce.plan import Plan, strongest_ablations
 from mjx_arm.reproduce.plots import draw_effects, draw_heights, draw_study
-from mjx_arm.reproduce.store import CELLS, Measured
+from mjx_arm.reproduce.store import Measured
 from mjx_arm.reproduce.trainings import ABLATION_MINUTES, ABLATIONS, DEFAULT, REWARDS, Ablation
 from mjx_arm.tools.compare import share_of
 from mjx_arm.training.evaluate import newcombe_interval
@@ -66,8 +64,8 @@ def _reward_figures(found: dict[str, list[Measured]]) -> Iterator[Block]:
         tuple(rows),
     )  # fmt: skip
     yield Text(
-        "Hovering: the cube is grasped and more than 20 cm high in an episode that fails. The best "
-        "agent of each run, one action in ten random."
+        "Hovering: the cube is grasped and more than 20 cm high in an episode that fails. The last "
+        "agent of each run is judged, not the best one, with one action in ten random."
     )
     labels = {name: REWARDS[name][1].partition(":")[0].replace("`", "") for name in found}
     curves = {labels[name]: [x.result["curve"] for x in cells] for name, cells in found.items()}
@@ -116,7 +114,7 @@ def paper(plan: Plan) -> Iterator[Block]:
     yield Heading("The preset `paper`")
     yield Text(
         "Every value that the paper states, in environment A, for 1,000,000 iterations: its "
-        "schedule of ε ends there. No success is selected for; what came out is reported as it is."
+        "schedule of ε ends there. The last agent is judged, not the best one."
     )
     found = plan.read("paper-A")
     if found is None:
@@ -160,7 +158,7 @@ def ablations(plan: Plan) -> Iterator[Block]:
     for env in ("A", "B"):
         names = [None, *ABLATIONS] if env == "A" else _repeated(plan)
         yield from _ablation_table(plan, env, names)
-    if not strongest_ablations(plan.store):
+    if not strongest_ablations(plan.store, plan.cells):
         yield Missing(
             "The three strongest changes are tried again in B once all of A are measured.",
             plan.command("ablations", "ablations-B"),
@@ -173,7 +171,7 @@ def ablations(plan: Plan) -> Iterator[Block]:
 
 
 def _repeated(plan: Plan) -> list[Ablation | None]:
-    strongest = strongest_ablations(plan.store)
+    strongest = strongest_ablations(plan.store, plan.cells)
     return [None, *(each for each in ABLATIONS if each.name in strongest)] if strongest else []
 
 
@@ -243,39 +241,3 @@ def _verdict(change: tuple[float, float, float] | None) -> str:
     if low > 0:
         return "Better than the default in this seed."
     return "No clear difference."
-
-
-def transfer(plan: Plan) -> Iterator[Block]:
-    """Figure 5 and the transfer to another world."""
-    yield Heading("Figure 5 and the transfer to another world")
-    rows, files, missing = [], [], []
-    for level in ("near", "medium", "far"):
-        file = f"{CELLS}/transfer-{level}.json"
-        path = plan.store.folder / file
-        if not path.is_file():
-            missing.append(level)
-            continue
-        try:
-            values = json.loads(path.read_text(encoding="utf-8"))
-            rows.append((level, percent(values["rate"]), interval(*values["ci95"])))
-            files.append(file)
-        except (ValueError, KeyError, TypeError):
-            # It is damaged, or the command was interrupted.
-            missing.append(level)
-    if rows:
-        yield Table(("level", "success", "95 % interval"), tuple(rows))
-        yield Source(tuple(files))
-    if missing:
-        folder = plan.store.folder / CELLS
-        yield Missing(
-            f"Success in the stand-in for reality at {', '.join(missing)}. Not measured yet.",
-            "\n".join(
-                f"mjx-arm transfer AGENT --level {level} --episodes 200 --json "
-                f"> {shlex.quote(f'{folder}/transfer-{level}.json')}"
-                for level in missing
-            ),
-        )
-    yield Text(
-        "Figure 5, the feature maps of each layer in simulation and in the stand-in, is not on "
-        "this page. `python benchmarks/feature_maps.py AGENT --out FOLDER` makes it."
-    )

@@ -7,6 +7,7 @@ import pathlib
 from collections.abc import Iterable, Iterator, Sequence
 
 from mjx_arm.config import TrainConfig, parse_config
+from mjx_arm.envs.randomisation import Ranges
 from mjx_arm.options import flat_names, get_option
 from mjx_arm.training.agent import BEST, LAST, find_agent, read_agent, shipped_agents
 from mjx_arm.training.run_folder import CONFIG, load_config, seed_configs, seed_folders
@@ -20,6 +21,7 @@ WAYS = {
     "pixels-paper": "sees pixels alone, no network ever saw the state, published reward",
     "state-paper": "sees the simulator's state, published reward",
 }
+_SCENE = "arm_cube"
 # Options in which seeds of one way may differ.
 _FREE = frozenset({"seed", "num_seeds", "total_steps", "physics", "env", "eval_episodes"})
 
@@ -56,12 +58,18 @@ class Subject:
 
 
 def way_of(config: TrainConfig) -> str | None:
-    """How a configuration trains, one of `WAYS`; None where the page has no place for it."""
-    if config.env.task != "lift" or config.env.reward not in ("completion", "shaped", "paper"):
+    """How a configuration trains, one of `WAYS`; None where the page has no place for it.
+
+    The page compares agents of one task in one scene, which nothing randomises.
+    """
+    env = config.env
+    if env.task != "lift" or env.reward not in ("completion", "shaped", "paper"):
         return None
-    sees = "state" if config.env.observation == "state" else "pixels"
+    if env.scene_name != _SCENE or env.randomise.ranges != Ranges():
+        return None
+    sees = "state" if env.observation == "state" else "pixels"
     base = "taught" if config.algorithm == "distill" else sees
-    return f"{base}-paper" if config.env.reward == "paper" else base
+    return f"{base}-paper" if env.reward == "paper" else base
 
 
 def find_runs(folder: pathlib.Path) -> list[Subject]:
@@ -101,7 +109,7 @@ def find_shipped() -> list[Subject]:
         metadata = read_agent(find_agent(pathlib.Path(name)))[0]
         config = parse_config(metadata["config"], name)
         way = way_of(config)
-        if way is not None and config.env.scene_name == "arm_cube":
+        if way is not None:
             found.append(Subject(way, config.env.env, config.seed, config, name, None))
     return found
 

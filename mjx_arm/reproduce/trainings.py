@@ -57,11 +57,20 @@ def _seconds(config: TrainConfig) -> float:
     return steps / _PIXELS * max(1.0, config.samples_per_step)
 
 
-def is_finished(training: Training, folder: pathlib.Path) -> bool:
-    """Whether a run folder holds the whole run, with the evaluation of each seed."""
+def is_same(training: Training, folder: pathlib.Path) -> bool:
+    """Whether a folder holds a run, finished or not, with the options of a training."""
     if not (folder / CONFIG).is_file():
         return False
-    seeds = seed_folders(folder, load_config(folder))
+    saved = load_config(folder)
+    # The backend of the physics is chosen by the machine.
+    return saved == set_train_options(training.config, {"physics": saved.env.physics})
+
+
+def is_finished(training: Training, folder: pathlib.Path) -> bool:
+    """Whether a folder holds the whole run of a training, with the evaluation of each seed."""
+    if not is_same(training, folder):
+        return False
+    seeds = seed_folders(folder, training.config)
     return all((seed / EVALUATION).is_file() for seed in seeds)
 
 
@@ -92,9 +101,7 @@ def run_training(training: Training, folder: pathlib.Path, console: Console) -> 
 
 
 def _check_same(training: Training, folder: pathlib.Path) -> None:
-    saved = load_config(folder)
-    wanted = set_train_options(training.config, {"physics": saved.env.physics})
-    if saved != wanted:
+    if not is_same(training, folder):
         raise ValueError(
             f"{folder} holds a run with other options than {training.name!r} has now: "
             "give --out another folder"
@@ -221,7 +228,8 @@ ABLATIONS = (
     Ablation("gamma", "γ = 0.98 instead of 0.99", {"gamma": 0.98}),
     Ablation("size", "images of 32×32 pixels instead of 64×64", {"size": (32, 32)}),
     Ablation("environments", "16 environments instead of 64, batches in proportion", {
-        "num_envs": 16, "teacher_batch_size": 128, "student_updates_per_step": 1,
+        "num_envs": 16, "teacher_batch_size": 128, "student_batch_size": 48,
+        "student_updates_per_step": 1,
     }),
     Ablation("normalisation", "no LayerNorm, in both networks", {
         "layer_norm": False, "teacher_layer_norm": False,

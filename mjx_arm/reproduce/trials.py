@@ -56,6 +56,18 @@ class Trial:
     max_steps: int = 1_000
 
 
+def agent_digest(agent: str) -> str:
+    """SHA-256 of an agent's file, in hexadecimal digits.
+
+    Args:
+      agent: what `load_agent` takes.
+
+    Raises:
+      ValueError: there is no such agent.
+    """
+    return hashlib.sha256(find_agent(pathlib.Path(agent)).read_bytes()).hexdigest()
+
+
 def trial_inputs(agent: str, trial: Trial) -> dict[str, Any]:
     """What a trial depends on, as a JSON object: the digest of the agent's file, and the options.
 
@@ -66,9 +78,8 @@ def trial_inputs(agent: str, trial: Trial) -> dict[str, Any]:
     Raises:
       ValueError: there is no such agent.
     """
-    content = find_agent(pathlib.Path(agent)).read_bytes()
     return {
-        "agent_sha256": hashlib.sha256(content).hexdigest(),
+        "agent_sha256": agent_digest(agent),
         "seed": _SEED,
         "reach": REACH,
         **dataclasses.asdict(trial),

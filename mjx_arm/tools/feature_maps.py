@@ -28,7 +28,7 @@ from mjx_arm.physics import compiler_options
 from mjx_arm.render import rgb
 from mjx_arm.standin.levels import Offsets
 from mjx_arm.standin.world import StandIn
-from mjx_arm.tools.transfer import ITERATIONS, NEAR_CUBE, start_keys
+from mjx_arm.tools.transfer import ITERATIONS, NEAR_CUBE, start_keys, without_randomisation
 from mjx_arm.training.agent import Agent
 
 _LAYERS = (PatchConv, nn.Conv, nn.Dense, nn.LayerNorm)
@@ -134,9 +134,9 @@ def compare_moments(
 ) -> list[Comparison]:
     """Compares the moment at which an agent is to close the gripper, in both worlds.
 
-    The agent acts greedily in the simulator. The moment is the first one at which it closes the
-    gripper within 3 cm of the cube; if it never does, the one nearest to the cube. The stand-in is
-    put into the same state.
+    The agent acts greedily in the simulator, without randomisation: the two worlds then differ by
+    the level alone. The moment is the first one at which it closes the gripper within 3 cm of the
+    cube; if it never does, the one nearest to the cube. The stand-in is put into the same state.
 
     Args:
       agent: that sees pixels by one camera.
@@ -153,6 +153,7 @@ def compare_moments(
     check_value("others", Count, others)
     if len(image_shape(agent)) != 3:
         raise ValueError("feature maps are compared for an agent with one camera")
+    agent = dataclasses.replace(agent, env=without_randomisation(agent.env))
     play, outputs = _make_episode(agent), make_layer_outputs(agent)
     comparisons = []
     with contextlib.closing(StandIn(agent.env, offsets, shadows=shadows)) as world:
@@ -247,7 +248,7 @@ def draw_comparisons(comparisons: Sequence[tuple[str, Comparison]]) -> bytes:
             figures = f"{layer.similarity:.3f} ({layer.yardstick:.3f})"
             _show(grid[row], one, other, f"{layer.name.split('/')[-1]}\n{figures}")
             row += 1
-    grid[0][0].set_title("simulator", fontsize=10)
+    grid[0][0].set_title("simulator, without randomisation", fontsize=10)
     grid[0][1].set_title("stand-in for reality", fontsize=10)
     figure.supxlabel(
         "cosine similarity of the two (in brackets: of the simulated image to other moments)",

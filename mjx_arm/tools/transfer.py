@@ -19,7 +19,8 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from mjx_arm.algos.exploration import check_epsilon, epsilon_greedy
-from mjx_arm.envs.env import Env
+from mjx_arm.envs.env import Env, make_env
+from mjx_arm.envs.randomisation import RandomisationConfig
 from mjx_arm.export import export_policy
 from mjx_arm.options import Count, check_value
 from mjx_arm.physics import compiler_options
@@ -146,6 +147,14 @@ def _dropped(trace: Trace) -> bool:
     return bool((lost & (trace.height[:-1] >= _LIFTED)).any())
 
 
+def without_randomisation(env: Env) -> Env:
+    """The same environment in which nothing varies but what its task varies."""
+    if not env.randomiser:
+        return env
+    config = dataclasses.replace(env.config, randomise=RandomisationConfig())
+    return make_env(config, reward=env.reward, scene=env.scene)
+
+
 def start_keys(seed: int, episodes: int) -> jax.Array:
     """Keys `[episodes]` of starts that neither training nor the selection of an agent has seen."""
     start_key, _ = jax.random.split(role_key(seed, EVALUATION))
@@ -154,6 +163,9 @@ def start_keys(seed: int, episodes: int) -> jax.Array:
 
 def sample_starts(env: Env, seed: int, episodes: int) -> list[Start]:
     """Starts that neither training nor the selection of an agent has seen.
+
+    They are those of the environment without randomisation: the stand-in's cube has the size that
+    the scene says.
 
     Args:
       env: the environment.
@@ -167,6 +179,7 @@ def sample_starts(env: Env, seed: int, episodes: int) -> list[Start]:
 @functools.lru_cache(maxsize=4)
 def _starter(env: Env) -> Callable[[jax.Array], tuple[jax.Array, jax.Array]]:
     """`keys [N] -> qpos [N, nq], ctrl [N, nu]` of starts, compiled once for an environment."""
+    env = without_randomisation(env)
 
     def start(key: jax.Array) -> tuple[jax.Array, jax.Array]:
         _, state = env.reset(key)
@@ -217,6 +230,9 @@ def in_simulation(
     agent: Agent, seed: int, episodes: int, *, epsilon: float = 0.1, iterations: int = ITERATIONS
 ) -> list[Trace]:
     """Runs an agent in its simulator, from the starts that `sample_starts` gives for the seed.
+
+    An agent that was trained with randomisation is tried with it. Where the cube's size varies, the
+    starts differ by what that changes: the height of the cube, or how far the gripper is closed.
 
     Args:
       agent: with the task `lift`.

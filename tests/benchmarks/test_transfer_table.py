@@ -29,7 +29,7 @@ def test_an_agent_is_read_three_times_under_whatever_name(tmp_path: pathlib.Path
 
 
 def test_a_cell_has_a_file_and_replaces_its_older_self(tmp_path: pathlib.Path) -> None:
-    cell = {"agent": "a", "world": "near", "start": "home", "rate": 0.5}
+    cell = {"agent": "a", "sha256": "1", "world": "near", "start": "home", "rate": 0.5}
     transfer.add_cell(tmp_path, cell)
     transfer.add_cell(tmp_path, cell | {"start": "in_grasp"})
     transfer.add_cell(tmp_path, cell | {"rate": 0.75})
@@ -38,3 +38,14 @@ def test_a_cell_has_a_file_and_replaces_its_older_self(tmp_path: pathlib.Path) -
     alone = json.loads((tmp_path / "cell-a-near-home.json").read_text())
     assert alone["rate"] == 0.75
     assert alone["machine"] == table["machine"]
+
+
+def test_a_new_agent_of_an_old_name_has_a_table_of_its_own(tmp_path: pathlib.Path) -> None:
+    cell = {"agent": "a", "sha256": "1", "world": "near", "start": "home", "rate": 0.5}
+    transfer.add_cell(tmp_path, cell)
+    transfer.add_cell(tmp_path, cell | {"agent": "b"})
+    transfer.add_cell(tmp_path, cell | {"sha256": "2", "world": "far"})
+    table = json.loads((tmp_path / "transfer.json").read_text())
+    assert [(x["agent"], x["world"]) for x in table["cells"]] == [("b", "near"), ("a", "far")]
+    files = sorted(path.name for path in tmp_path.glob("cell-*.json"))
+    assert files == ["cell-a-far-home.json", "cell-b-near-home.json"]

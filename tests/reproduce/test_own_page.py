@@ -52,8 +52,10 @@ def test_every_cell_names_its_command(made):
     assert cells
     page = (made / "index.md").read_text()
     for path in cells:
-        cell = json.loads(path.read_text())
-        assert cell["command"] == " ".join(
-            ["mjx-arm", "reproduce", "--only", cell["name"], *ARGUMENTS]
-        )
+        if path.name.startswith("cell-"):
+            continue  # of `transfer.json`, which has them all
         assert f"`cells/{path.name}`" in page
+        if path.stem not in ("figure5", "transfer"):  # by benchmarks
+            cell = json.loads(path.read_text())
+            command = ["mjx-arm", "reproduce", "--only", cell["name"], *ARGUMENTS]
+            assert cell["command"] == " ".join(command)

@@ -6,20 +6,25 @@ import dataclasses
 import json
 
 import pytest
+from rich.console import Console
 
 from mjx_arm.cli import main
 from mjx_arm.reproduce.plan import make_plan, strongest_ablations
-from mjx_arm.reproduce.store import Measured, Store
+from mjx_arm.reproduce.store import Measured
 from mjx_arm.reproduce.trainings import (
     ABLATION_MINUTES,
     ABLATIONS,
     STRONGEST,
+    Training,
     ablation_training,
     agent_trainings,
     paper_training,
     reward_trainings,
+    run_training,
     shorten,
 )
+from mjx_arm.scene import load_scene
+from mjx_arm.training.run_folder import SavedRun, save_run
 
 
 def plan_of(tmp_path, **options):
@@ -88,20 +93,88 @@ def test_every_training_has_hours_and_a_quick_form():
         assert quick.hours < 0.05
 
 
-def write_rate(store: Store, name: str, rate: float) -> None:
-    store.write(Measured(name, "", {}, {"rate": rate}, (), {}, 0.0, ""), {})
+def write_rate(plan, name: str, rate: float) -> None:
+    (cell,) = [cell for cell in plan.cells if cell.name == name]
+    inputs = json.loads(json.dumps(cell.inputs()))
+    plan.store.write(Measured(name, "", inputs, {"rate": rate}, (), {}, 0.0, ""), {})
+
+
+def strongest(plan) -> list[str]:
+    return strongest_ablations(plan.store, plan.cells)
+
+
+def write_rates(plan) -> None:
+    rates = {"gamma": 0.2, "loss": 0.95, "replay": 0.5}
+    write_rate(plan, "ablation-A-default", 0.8)
+    for ablation in ABLATIONS:
+        if ablation.changes is not None:
+            assert strongest(plan) == []
+            write_rate(plan, f"ablation-A-{ablation.name}", rates.get(ablation.name, 0.8))
 
 
 def test_the_strongest_changes_are_known_when_all_are_measured(tmp_path):
-    store = Store(tmp_path)
-    store.prepare()
-    rates = {"gamma": 0.2, "loss": 0.95, "replay": 0.5}
-    write_rate(store, "ablation-A-default", 0.8)
-    for ablation in ABLATIONS:
-        if ablation.changes is not None:
-            assert strongest_ablations(store) == []
-            write_rate(store, f"ablation-A-{ablation.name}", rates.get(ablation.name, 0.8))
-    assert strongest_ablations(store) == ["gamma", "replay", "loss"]
+    plan = plan_of(tmp_path)
+    plan.store.prepare()
+    write_rates(plan)
+    assert strongest(plan) == ["gamma", "replay", "loss"]
+    planned = [training.name for training in plan_of(tmp_path).trainings]
+    assert [name for name in planned if name.startswith("ablation-B")] == [
+        f"ablation-B-{name}" for name in ("default", "gamma", "replay", "loss")
+    ]
+
+
+def test_the_strongest_changes_of_a_quick_run_are_not_those_of_the_study(tmp_path):
+    quick = plan_of(tmp_path, quick=True)
+    quick.store.prepare()
+    write_rates(quick)
+    assert strongest(quick) == ["gamma", "replay", "loss"]
+    plan = plan_of(tmp_path)
+    assert strongest(plan) == []
+    assert not any(training.name.startswith("ablation-B") for training in plan.trainings)
+
+
+def test_fewer_environments_sample_as_much_for_each_step():
+    samples = []
+    for name in ("default", "environments"):
+        config = ablation_training(name, "A").config
+        algo = config.algo
+        samples.append(
+            (
+                algo.teacher_batch_size * algo.teacher_updates_per_step / config.num_envs,
+                algo.student_batch_size * algo.student_updates_per_step / config.num_envs,
+            )
+        )
+    assert samples == [(8.0, 3.0)] * 2
+
+
+def save_finished(training: Training, folder) -> None:
+    """The files by which a finished run is known."""
+    folder.mkdir(parents=True)
+    save_run(folder, SavedRun(training.config, {}, load_scene("arm_cube").source))
+    (folder / "evaluation.json").write_text("{}")
+
+
+def test_a_finished_run_of_other_options_is_rejected(tmp_path):
+    options = {"only": ("reward-completion-seed0",)}
+    quick, plan = plan_of(tmp_path, quick=True, **options), plan_of(tmp_path, **options)
+    (short,), (wanted,) = quick.wanted_trainings(), plan.wanted_trainings()
+    save_finished(short, quick.run_folder(short))
+    assert quick.wanted_trainings() == []
+    assert plan.wanted_trainings() == [wanted]
+    with pytest.raises(ValueError, match=r"other options than 'reward-completion-seed0' has now"):
+        run_training(wanted, plan.run_folder(wanted), Console(quiet=True))
+
+
+@pytest.mark.parametrize("name", ["agent-A-seed0", "pixels-A-seed0"])
+def test_an_agent_of_a_quick_run_is_not_shown_as_the_trained_one(tmp_path, name):
+    quick = plan_of(tmp_path, quick=True)
+    short = next(each for each in quick.trainings if each.name == name)
+    save_finished(short, quick.run_folder(short))
+    (quick.run_folder(short) / "last.safetensors").write_bytes(b"")
+    folder = str(quick.run_folder(short))
+    shown = [{x.agent for x in plan_of(tmp_path, quick=q).subjects} for q in (True, False)]
+    assert folder in shown[0]
+    assert folder not in shown[1]
 
 
 @pytest.mark.parametrize(
@@ -132,13 +205,15 @@ def test_a_page_without_any_cell_names_every_command(tmp_path, capsys):
     for part in (
         *("figure1-arm_cube", "figure2-taught-A-seed0", "episodes-taught-B-seed0-in-A"),
         *("figure4-taught-B-seed0", "reward-published-seed0", "paper-A", "ablation-A-gamma"),
-        "mjx-arm transfer AGENT --level near",
+        "python benchmarks/transfer.py taught-A-seed0=agent-a taught-B-seed0=agent-b --levels near",
+        "python benchmarks/feature_maps.py taught-A-seed0=agent-a taught-B-seed0=agent-b --page",
     ):
         assert part in page
     assert "http" not in page.replace("http-equiv", "")
     text = (out / "index.md").read_text()
     assert f"\nmjx-arm reproduce --shipped --out '{out}'\n" in text
-    assert f"> '{out}/cells/transfer-near.json'" in text
+    assert f" --levels near medium far --out '{out}/cells'\n" in text
+    assert f" --page '{out}'\n" in text
 
 
 def test_options_of_a_cell_that_changed_make_it_missing(tmp_path):

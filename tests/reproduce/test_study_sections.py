@@ -7,14 +7,15 @@ import json
 import pytest
 from made_runs import make_run
 
-from mjx_arm.reproduce import command
+from mjx_arm.reproduce import command, studies
 from mjx_arm.reproduce.curves import read_curve
-from mjx_arm.reproduce.page import page_blocks, write_pages
+from mjx_arm.reproduce.page import write_pages
 from mjx_arm.reproduce.plan import make_plan
 from mjx_arm.reproduce.records import CAUSES, HEIGHT_EDGES
 from mjx_arm.reproduce.store import Measured
-from mjx_arm.reproduce.studies import measure_ablation
+from mjx_arm.reproduce.studies import measure_ablation, measure_paper, measure_reward
 from mjx_arm.reproduce.trainings import ABLATIONS
+from mjx_arm.reproduce.trials import Trial
 from mjx_arm.training.evaluate import wilson_interval
 
 
@@ -111,6 +112,19 @@ def test_the_preset_paper_is_reported_both_ways(tmp_path, run):
     assert "| greedy | 0.0 % |" in text
 
 
+def test_the_last_agent_of_a_study_is_judged(run, monkeypatch):
+    judged = []
+
+    def measure(name, path, trial, pictures):
+        judged.append(path)
+        return {"episodes_each": {}}, {}
+
+    monkeypatch.setattr(studies, "measure_episodes", measure)
+    measure_reward("reward", run, Trial("A", 1))
+    measure_paper("paper", run, {"greedy": Trial("A", 1)})
+    assert judged == [str(run / "last.safetensors")] * 2
+
+
 def test_each_change_has_its_difference_and_a_sentence(tmp_path, run):
     plan = plan_of(tmp_path / "page")
     plan.store.prepare()
@@ -140,14 +154,3 @@ def test_the_last_change_in_a_puts_the_changes_in_b_on_the_same_page(tmp_path, r
     )
     page = command.reproduce(tmp_path / "page", shipped=True, only=("ablations",))
     assert "Not measured yet: `ablation-B-default`" in page.with_name("index.md").read_text()
-
-
-def test_transfer_is_shown_when_its_files_are_there(tmp_path):
-    plan = plan_of(tmp_path / "page")
-    plan.store.prepare()
-    path = plan.store.folder / "cells" / "transfer-near.json"
-    path.write_text(json.dumps({"rate": 0.8, "ci95": [0.7, 0.9]}))
-    text = text_of(plan)
-    assert "| near | 80.0 % | 70.0 to 90.0 |" in text
-    assert "at medium, far" in text
-    assert list(page_blocks(plan))

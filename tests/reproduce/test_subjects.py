@@ -25,6 +25,16 @@ def test_runs_are_sorted_by_how_they_were_trained(tmp_path):
     assert names == ["taught-B-seed0", "pixels-B-seed0", "pixels-paper-A-seed0"]
 
 
+@pytest.mark.parametrize(
+    "options",
+    [{"scene": "arm_cube_desk"}, {"randomisation": "tight"}, {"link_mass": (0.9, 1.1)}],
+)
+def test_an_agent_of_another_world_is_not_on_the_page(tmp_path, options):
+    make_run(tmp_path / "plain", env="B")
+    make_run(tmp_path / "other", env="B", seed=1, **options)
+    assert [subject.name for subject in find_runs(tmp_path)] == ["pixels-B-seed0"]
+
+
 def test_each_seed_of_a_run_is_an_agent(tmp_path):
     make_run(tmp_path / "run", (90, 80), env="A")
     subjects = find_runs(tmp_path / "run")

@@ -9,6 +9,7 @@ from PIL import Image
 
 from mjx_arm.export import to_observation
 from mjx_arm.standin.levels import Offsets, find_level
+from mjx_arm.tools import feature_maps
 from mjx_arm.tools.feature_maps import (
     compare_moments,
     cosine,
@@ -48,6 +49,23 @@ def test_the_outputs_are_those_of_the_network() -> None:
     advantages = q - q.mean(axis=-1, keepdims=True)
     assert list(outputs)[-1] == "Q-values"
     assert outputs["Q-values"] == pytest.approx(advantages, abs=1e-4)
+
+
+def test_the_simulator_shows_the_plain_scene_whatever_training_varied(monkeypatch) -> None:
+    agent = load_agent("agent-a", randomisation="standard")
+    used = []
+
+    def no_opengl(env, *_, **__):
+        used.append(env)
+        raise ValueError("no OpenGL")
+
+    monkeypatch.setattr(feature_maps, "_make_episode", lambda agent: used.append(agent.env))
+    monkeypatch.setattr(feature_maps, "StandIn", no_opengl)
+    with pytest.raises(ValueError, match="no OpenGL"):
+        compare_moments(agent, Offsets(), seed=3, episodes=1)
+    assert agent.env.randomiser
+    assert not used[0].randomiser
+    assert used[1] is used[0]
 
 
 @pytest.mark.slow

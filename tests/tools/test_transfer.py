@@ -3,11 +3,15 @@ from __future__ import annotations
 import json
 
 import imageio.v3 as imageio
+import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
 
 import mjx_arm
 from mjx_arm.cli import main
+from mjx_arm.envs.tasks.lift import grasped
+from mjx_arm.kinematics import Poses
 from mjx_arm.standin.episodes import Trace
 from mjx_arm.tools.transfer import in_simulation, sample_starts, summarise
 from mjx_arm.training.agent import load_agent
@@ -89,6 +93,21 @@ def test_starts_depend_on_the_seed(env) -> None:
     assert all(np.array_equal(x.qpos, y.qpos) for x, y in zip(one, same, strict=True))
     assert not np.array_equal(one[0].qpos, other[0].qpos)
     assert not np.array_equal(one[0].qpos, one[1].qpos)
+
+
+@pytest.mark.parametrize("start", ["home", "in_grasp"])
+def test_starts_fit_the_cube_of_the_scene_whatever_training_varied(start) -> None:
+    env = mjx_arm.make("A", randomisation="standard", start=start)
+    task, data = env.task, mujoco.MjData(env.scene.mj_model)
+    for found in sample_starts(env, 1, 4):
+        if start == "home":
+            assert found.qpos[task.cube_qpos + 2] == np.float32(task.half_size)
+            continue
+        data.qpos[:] = found.qpos
+        mujoco.mj_kinematics(env.scene.mj_model, data)
+        poses = Poses(*map(jnp.asarray, (data.geom_xpos, data.geom_xmat, data.site_xpos)))
+        poses = poses.replace(geom_xmat=poses.geom_xmat.reshape(-1, 3, 3))
+        assert grasped(task, poses, found.ctrl)
 
 
 @pytest.mark.slow

@@ -29,9 +29,9 @@ class RandomisationConfig:
     """Options of domain randomisation: what differs from episode to episode.
 
     An option that is None has the value of the preset `randomisation`. Values are uniform in their
-    ranges, and sampled when an episode starts. `off` varies nothing. Where others have published
-    ranges, the presets follow them: `tight` those of Squint (arXiv 2602.21203), `standard` those of
-    MuJoCo Playground's `randomize_vision.py`.
+    ranges, and sampled when an episode starts. `off` varies nothing. Some ranges follow published
+    ones: of `tight` those of Squint (arXiv 2602.21203), of `standard` those of MuJoCo Playground's
+    `randomize_vision.py`. All others are our choice; see `PRESETS`.
 
     Attributes:
       randomisation: `off`, `tight` or `standard`.
