@@ -364,6 +364,10 @@ def advice(config: TrainConfig) -> list[str]:
             f"the replay holds {config.replay_slots} steps of each environment, less than a "
             f"quarter of an episode: give --replay-size {config.env.max_steps * config.num_envs}"
         )
+    if config.env.observation == "state" and config.network.dense_layers != 1:
+        said.append(
+            "--dense-layers changes networks that see images; one of state features has two"
+        )
     if config.samples_per_step < 0.25:
         said.append(
             f"training samples {config.samples_per_step:.2g} transitions for each environment "

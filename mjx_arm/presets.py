@@ -21,6 +21,9 @@ divergence     not stated                     an episode whose simulation diverg
                                               its last transition is not learnt from
 judged agent   not stated                     the best of those that are tried on 64 held-out
                                               episodes every 262,144 steps: a later one can be worse
+end of time    not stated                     an episode that is cut at 1,000 iterations has not
+                                              failed: its last Q-value counts
+first values   not stated                     a new network's Q-values are 0
 evaluation     50 episodes                    1,000, each with a new place for the cube: a narrower
                                               interval
 =============  =============================  =====================================================

@@ -130,7 +130,9 @@ def merge_params(
     for field, ids in second_varies.items():
         own = first_varies.get(field, ())
         places = [k for k, row in enumerate(ids) if row not in own]
-        values = second[field] if len(places) == len(ids) else second[field][np.asarray(places)]
+        # An integer type even where no row is left.
+        rows = np.asarray(places, np.int32)
+        values = second[field] if len(places) == len(ids) else second[field][rows]
         merged[field] = jnp.concatenate([first[field], values]) if own else values
     return merged
 

@@ -302,8 +302,9 @@ def test_eval_prints_json(run_folder, capsys):
     report = json.loads(capsys.readouterr().out)
     assert report["episodes"] == 5
     assert set(report) == {
-        *("episodes", "successes", "rate", "ci95", "mean_length", "metrics"),
+        *("episodes", "successes", "rate", "ci95", "mean_length", "metrics", "differs"),
     }
+    assert report["differs"]["env"] == ["A", "B"]
 
 
 def test_play_writes_a_gif(run_folder, tmp_path, capsys):

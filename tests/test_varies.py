@@ -6,7 +6,15 @@ import mujoco
 import numpy as np
 import pytest
 
-from mjx_arm.varies import check_params, check_varies, fill, own_params, rows
+from mjx_arm.varies import (
+    check_params,
+    check_varies,
+    fill,
+    merge_params,
+    merge_varies,
+    own_params,
+    rows,
+)
 
 XML = """
 <mujoco>
@@ -89,3 +97,17 @@ def test_params_must_fit(model, params, message):
 def test_fill_names_a_missing_field(model):
     with pytest.raises(ValueError, match="params lacks 'geom_size'"):
         fill(model, {"geom_size": (0,)}, {}, "geom_size")
+
+
+def test_what_both_vary_has_the_first_ones_value():
+    first, second = {"body_mass": (2,)}, {"body_mass": (1, 2)}
+    values = merge_params(
+        first, {"body_mass": np.asarray([7.0])}, second, {"body_mass": np.asarray([1.0, 2.0])}
+    )
+    assert merge_varies(first, second) == {"body_mass": (2, 1)}
+    assert values["body_mass"].tolist() == [7.0, 1.0]
+    # Also where nothing is left of the second.
+    values = merge_params(
+        first, {"body_mass": np.asarray([7.0])}, first, {"body_mass": np.asarray([2.0])}
+    )
+    assert values["body_mass"].tolist() == [7.0]

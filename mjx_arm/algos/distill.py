@@ -15,6 +15,7 @@ import chex
 import flax.struct
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 
 from mjx_arm.algos.dqn import Learner, QLearning, first_update, num_microbatches, update_when
@@ -124,7 +125,8 @@ class Distill:
         config = self.config
         images = config.student_batch_size * config.student_updates_per_step
         warm_up = -(-config.student_warm_up // images) * self.num_envs
-        return env_steps >= config.student_starts + warm_up
+        # The largest number of an int32 stands for never.
+        return env_steps >= min(config.student_starts + warm_up, np.iinfo(np.int32).max)
 
     def q_values(self, pair: Pair, obs: Obs, frame: Frame, env_steps: jax.Array) -> jax.Array:
         """The student's Q-values where it drives, the teacher's in the other environments."""

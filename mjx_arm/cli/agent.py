@@ -119,11 +119,12 @@ class Eval(AgentOptions):
                 mesh=make_mesh(jax.local_device_count()),
             )
         report = dataclasses.asdict(result)
+        differs = differences(agent.trained_env, agent.config.env)
         if self.json:
-            print(json.dumps(report))
+            print(json.dumps(report | {"differs": differs}))
             return
         print_report(report | report.pop("metrics"))
-        for name, (trained, judged) in differences(agent.trained_env, agent.config.env).items():
+        for name, (trained, judged) in differs.items():
             print(f"trained with {name} = {trained}, judged with {judged}")
 
 

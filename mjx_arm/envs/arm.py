@@ -177,6 +177,11 @@ def _range(scene: Scene, servo: int) -> np.ndarray:
         raise ValueError(
             f"{_label(scene, servo)} has no range of commands: give it ctrlrange or inheritrange"
         )
+    joint = model.actuator_trnid[servo, 0]
+    if model.actuator_trntype[servo] == _JOINT and model.jnt_limited[joint]:
+        # A command beyond the joint's own range would be one for a pose that it cannot take.
+        low, high = model.jnt_range[joint]
+        bounds = np.clip(bounds, low, high)
     return bounds.astype(np.float32)
 
 

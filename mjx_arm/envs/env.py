@@ -426,6 +426,8 @@ def make_env(config: EnvConfig, *, reward: Reward | None = None, scene: Scene | 
         image_kinematics=make_kinematics(model, shown) if randomiser else kinematics,
         cameras=_make_cameras(scene, config, shown),
     )
+    if not is_of_package(type(task)):
+        _check_measures(env)
     if is_reference(config.reward) or not is_of_package(reward):
         _check_reward(env)
     return env
@@ -434,6 +436,30 @@ def make_env(config: EnvConfig, *, reward: Reward | None = None, scene: Scene | 
 def _remake(config: EnvConfig, reward: Reward | None, name: str, source: SceneSource) -> Env:
     """An environment that was pickled."""
     return make_env(config, reward=reward, scene=compile_scene(name, source))
+
+
+# What a run writes under these names beside what a task measures.
+_TAKEN = ("length", "reward", "max_q", "blocked")
+
+
+def _check_measures(env: Env) -> None:
+    """Rejects what a task of the user's measures, where a run could not count it."""
+    name = f"the task {env.config.task!r}"
+
+    def check(key: jax.Array) -> Any:
+        return env.task.measure(env._start(key, env._sample_placement(key), True))
+
+    measured = jax.eval_shape(check, jax.random.key(0))
+    if "success" not in measured:
+        raise ValueError(f"{name} must measure 'success', got {sorted(measured)}")
+    for metric, value in measured.items():
+        said = f"{list(value.shape)} {value.dtype}"
+        if said not in ("[] bool", "[] float32"):
+            raise ValueError(f"{name}: {metric!r} must be [] bool or [] float32, got {said}")
+        if metric in _TAKEN:
+            raise ValueError(f"{name}: a run counts {metric!r} itself, give it another name")
+    if measured["success"].dtype != jnp.bool_:
+        raise ValueError(f"{name}: 'success' must be [] bool, got [] float32")
 
 
 def _check_reward(env: Env) -> None:

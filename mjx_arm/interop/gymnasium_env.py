@@ -16,6 +16,7 @@ from gymnasium.vector import AutoresetMode
 from mjx_arm.envs.auto_reset import AutoReset
 from mjx_arm.envs.env import Env, make
 from mjx_arm.envs.state import EnvState
+from mjx_arm.options import Count, check_value
 from mjx_arm.physics import compiler_options
 
 # Edge of the images of `render`, pixels, and how many of them make a second of video.
@@ -154,8 +155,7 @@ class ArmCubeVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         render_mode: str | None = None,
         **options: Any,
     ):
-        if num_envs < 1:
-            raise ValueError(f"num_envs must be at least 1, got {num_envs}")
+        check_value("num_envs", Count, num_envs)
         _check_process()
         _check_render_mode(render_mode)
         self.render_mode = render_mode
@@ -179,7 +179,10 @@ class ArmCubeVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
     def reset(
         self, *, seed: int | list[int] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Starts an episode in every environment.
+        """Starts an episode in every environment, as if it were its first.
+
+        What outlives an episode does not outlive a reset: in B the cube gets a new place, and the
+        ranges of a curriculum are the first ones again. At the end of an episode `step` goes on.
 
         Args:
           seed: one whole number for all environments.

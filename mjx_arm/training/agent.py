@@ -239,8 +239,9 @@ def load_agent(
     check_record(json.loads(metadata["objects"]), trained, objects, str(path))
     stored = SceneSource.from_json(json.loads(metadata["scene"]), str(path))
     if isinstance(env, Env):
-        if options:
-            raise ValueError(f"make env= with {', '.join(options)}, which it has options for")
+        given = [*options, *["scene"] * (scene is not None), *["max_steps"] * (max_steps != 1_000)]
+        if given:
+            raise ValueError(f"make env= with {', '.join(given)}, which it has options for")
         config, made = dataclasses.replace(trained, env=env.config), env
     else:
         judged = evaluation_config(trained.env, env=env, max_steps=max_steps)

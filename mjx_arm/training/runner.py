@@ -50,7 +50,6 @@ from mjx_arm.training.agent import (
     STORED,
     add_evaluation,
     check_tensors,
-    differences,
     evaluation_config,
     find_agent,
     flatten_params,
@@ -212,6 +211,7 @@ def train(
     console.print(f"run folder: {chosen}", soft_wrap=True)
     if preset is not None:
         console.print(f"preset: {preset}")
+    _check_selects(config, stop_at)
     trainer = _prepare(config, objects, console, devices)
     config = trainer.config
     recorded = record(config, objects)
@@ -232,6 +232,9 @@ def train(
             state = place(dataclasses.replace(state, learner=learner), trainer.shapes())
         run = SavedRun(_with_backend(config, trainer), recorded, trainer.env.scene.source)
         on_writer(lambda: save_run(made, run))
+        if start is not None:
+            # Or a run that is killed before its first checkpoint would begin with a new network.
+            RunCheckpoints(made, run.origin).save(0, state)
         loop = _Loop(trainer, run, run_chunk, made, console, stop_at, minutes, on_chunk)
         console.print(f"training: {config.total_steps:,} environment steps")
         loop.run(state, 0)
@@ -295,6 +298,7 @@ def resume(
     config = saved.config
     if total_steps is not None:
         config = dataclasses.replace(config, total_steps=total_steps)
+    _check_selects(config, stop_at)
     with _locked(folder):
         console.print(f"run folder: {folder}", soft_wrap=True)
         trainer = _prepare(config, objects, console, devices, scene)
@@ -413,8 +417,10 @@ def _scene_of(folder: pathlib.Path, saved: SavedRun, objects: Objects) -> Scene:
 
 def _check_same_env(saved: TrainConfig, given: TrainConfig, folder: pathlib.Path) -> None:
     """Rejects an environment that is passed again with other options."""
-    for name, (was, now) in differences(saved.env, given.env).items():
-        raise ValueError(f"{folder} was made with an env= of {name} = {was}, got {now}")
+    for name in flat_names(saved.env):
+        was, now = get_option(saved.env, name), get_option(given.env, name)
+        if was != now:
+            raise ValueError(f"{folder} was made with an env= of {name} = {was}, got {now}")
 
 
 def _read_policy(trainer: Trainer, path: pathlib.Path) -> Any:
@@ -439,12 +445,23 @@ def _check_options(eval_episodes: int, stop_at: float | None, minutes: float | N
     check_value("minutes", Positive | None, minutes)
 
 
+def _check_selects(config: TrainConfig, stop_at: float | None) -> None:
+    if stop_at is not None and config.select_every == 0:
+        raise ValueError(
+            f"stop_at is a success rate of the selections, of which there are none: got {stop_at} "
+            "with select_every 0"
+        )
+
+
 def _check_whole_run(folder: pathlib.Path) -> None:
     """Rejects the folder of one seed of several, whose checkpoints are those of all."""
     parent = folder.resolve().parent
     if not (parent / "config.json").is_file():
         return
-    seeds = seed_folders(parent, load_run(parent).config)
+    try:
+        seeds = seed_folders(parent, load_run(parent).config)
+    except ValueError:
+        return  # some other program's file
     if len(seeds) > 1 and folder.resolve() in seeds:
         raise ValueError(f"{folder} is one seed of several: give the folder of all, {parent}")
 

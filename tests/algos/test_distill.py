@@ -460,3 +460,8 @@ def test_the_teacher_has_its_own_options():
     assert not other.huber
     assert "LayerNorm" not in names
     assert names.count("Dense") == 3
+
+
+def test_the_largest_start_stands_for_never():
+    toy = make_toy(student_starts=2**31 - 1, student_warm_up=100)
+    assert not toy.acts_on_obs(jnp.int32(2**31 - 2))

@@ -150,3 +150,10 @@ def test_the_shipped_scene_says_what_the_features_begin_with(env):
     obs, state = jax.jit(env.reset)(jax.random.key(0))
     np.testing.assert_array_equal(obs[:6], state.physics.qpos[env.arm.qpos])
     assert len(env.feature_scales) == len(obs)
+
+
+def test_no_command_leaves_the_range_of_its_joint(tmp_path):
+    wider = '<position name="rail" joint="rail" kp="100" ctrlrange="-2 0.25"/>'
+    narrow = '<position name="rail" joint="rail" kp="100" inheritrange="1"/>'
+    arm = crane(tmp_path, (narrow, wider))
+    assert arm.ctrl_range[0].tolist() == [-0.5, 0.25]

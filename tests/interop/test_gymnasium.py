@@ -210,7 +210,7 @@ def test_what_makes_no_task_is_rejected(later):
 
 
 def test_bad_vector_options_are_rejected():
-    with pytest.raises(ValueError, match="num_envs must be at least 1, got 0"):
+    with pytest.raises(ValueError, match="num_envs must be a whole number of at least 1, got 0"):
         mjx_arm.interop.ArmCubeVectorEnv(num_envs=0)
     with pytest.raises(ValueError, match="unknown auto-reset mode"):
         mjx_arm.interop.ArmCubeVectorEnv(autoreset="never")

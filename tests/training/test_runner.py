@@ -401,3 +401,36 @@ def test_it_is_said_why_devices_are_left_out(monkeypatch):
         "2 of 3 devices are used: num_envs must be a multiple of the number of devices, 3, got 64\n"
     )
     assert runner._num_devices(config, Objects(), 1, console) == 1
+
+
+def test_a_run_from_an_agent_that_is_killed_early_goes_on_from_it(plain, tmp_path):
+    folder, agent = tmp_path / "run", mjx_arm.load_agent(plain)
+
+    def fail(rows, state):
+        raise RuntimeError("killed")
+
+    config = set_train_options(CONFIG, {"learning_starts": 10**6, "seed": 5})
+    with pytest.raises(RuntimeError, match="killed"):
+        train(folder, config, init_from=plain, on_chunk=fail)
+    assert RunCheckpoints(folder).steps() == [0]
+    resume(folder)
+    again = mjx_arm.load_agent(folder)
+    for a, b in zip(*map(jax.tree.leaves, (again.params, agent.params)), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_stop_at_needs_selections(tmp_path):
+    with pytest.raises(ValueError, match=r"of which there are none: got 0\.5 with select_every 0"):
+        train(tmp_path / "run", stop_at=0.5)
+    assert not (tmp_path / "run").exists()
+
+
+def test_the_configuration_of_another_program_beside_a_run_is_left_alone(tmp_path):
+    (tmp_path / "config.json").write_text('{"name": "a web page"}')
+    runner._check_whole_run(tmp_path / "run")
+
+
+def test_an_environment_with_other_starts_is_rejected(tmp_path):
+    given = set_train_options(CONFIG, {"placement": "after_success"})
+    with pytest.raises(ValueError, match="env= of placement = None, got after_success"):
+        runner._check_same_env(CONFIG, given, tmp_path)

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import pathlib
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +12,7 @@ import pytest
 import mjx_arm
 from mjx_arm.algos.frames import make_frames
 from mjx_arm.envs.auto_reset import AutoResetState
-from mjx_arm.envs.tasks.reach import ReachConfig, completion_reward, sparse_reward
+from mjx_arm.envs.tasks.reach import Reach, ReachConfig, completion_reward, sparse_reward
 from mjx_arm.physics import compiler_options, make_physics
 
 XML = pathlib.Path(__file__).parents[3] / "xml"
@@ -262,3 +263,33 @@ def test_the_scene_has_the_arm_of_arm_cube_without_the_cube(capfd, tmp_path, mon
     assert text == other.xml.encode()
     assert capfd.readouterr() == ("", "")
     assert not list(tmp_path.iterdir())
+
+
+class Miscounted(Reach):
+    """A task that measures one thing too many, or of a wrong type, or no success."""
+
+    changes: ClassVar[dict[str, object]] = {}
+
+    def measure(self, state):
+        """What `Reach` measures, changed."""
+        measured = super().measure(state) | self.changes
+        return {name: value for name, value in measured.items() if value is not None}
+
+
+mjx_arm.register("miscounted", Miscounted, config=ReachConfig, scene="arm_reach")
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"success": None}, "must measure 'success', got ['distance']"),
+        ({"success": jnp.ones(())}, "'success' must be [] bool, got [] float32"),
+        ({"max_q": jnp.ones(())}, "a run counts 'max_q' itself, give it another name"),
+        ({"speed": jnp.zeros(2)}, "'speed' must be [] bool or [] float32, got [2] float32"),
+    ],
+)
+def test_what_a_run_cannot_count_is_rejected(changes, message, monkeypatch):
+    monkeypatch.setattr(Miscounted, "changes", changes)
+    with pytest.raises(ValueError, match="the task 'miscounted'") as error:
+        mjx_arm.make("A", task="miscounted", physics="native", observation="state")
+    assert message in str(error.value)
