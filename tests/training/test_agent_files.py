@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 import safetensors.numpy
 
-import mjx_arm
 from mjx_arm import load_agent, load_scene
 from mjx_arm.cli import main
 from mjx_arm.config import train_config
@@ -185,10 +184,3 @@ def test_an_epsilon_that_is_no_share_is_rejected(agent_file):
     for epsilon in (float("nan"), -0.1, 1.1, "0.1", True, None):
         with pytest.raises(ValueError, match="epsilon must be a finite number from 0 to 1, got"):
             agent.act(np.zeros(3, np.float32), jax.random.key(0), epsilon)
-
-
-def test_an_environment_has_its_own_scene_and_length(agent_file):
-    env = mjx_arm.make("A", physics="native", observation="state")
-    for name, value in (("scene", "arm_cube"), ("max_steps", 20)):
-        with pytest.raises(ValueError, match=f"make env= with {name}, which it has options for"):
-            mjx_arm.load_agent(agent_file, env=env, **{name: value})

@@ -180,6 +180,8 @@ def test_an_own_environment_and_algorithm_reach_training(tmp_path, monkeypatch):
     assert isinstance(agent.algorithm, OwnDQN)
     with pytest.raises(ValueError, match="pass it again as algorithm="):
         mjx_arm.load_agent(folder, env=env)
+    with pytest.raises(ValueError, match="make env= with scene, max_steps, which it has options"):
+        mjx_arm.load_agent(folder, env=env, algorithm=make_own, scene="arm_cube", max_steps=20)
     with pytest.raises(ValueError, match="pass it again as env="):
         resume(folder, algorithm=make_own, total_steps=320)
     other = mjx_arm.make("B", reward=pay_seven, lift=0.2, **options)

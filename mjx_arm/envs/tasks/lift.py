@@ -18,6 +18,7 @@ from mjx_arm.envs.arm import Arm
 from mjx_arm.envs.collision import Obstacle
 from mjx_arm.envs.state import EnvState, Snapshot
 from mjx_arm.envs.tasks.base import Reward, TaskConfig, rectangle
+from mjx_arm.envs.tasks.rest import check_rests
 from mjx_arm.kinematics import Poses, make_kinematics
 from mjx_arm.options import Positive, Share, options
 from mjx_arm.scene import Scene
@@ -400,6 +401,7 @@ def _check_cube(scene: Scene, geom: int, arm: Arm) -> float:
             f"scene {name!r}: in the keyframe 'home' the cube must be level, turned about the "
             f"vertical only, got the quaternion {turn.tolist()}"
         )
+    check_rests(scene, arm, start + 2, "cube")
     low, high = arm.ctrl_range[arm.gripper_ctrl]
     if not low < half < high:
         raise ValueError(

@@ -15,6 +15,7 @@ import numpy as np
 from mjx_arm.envs.arm import Arm
 from mjx_arm.envs.state import EnvState, Snapshot
 from mjx_arm.envs.tasks.base import Obstacle, Reward, TaskConfig, find_marker, rectangle
+from mjx_arm.envs.tasks.rest import check_rests
 from mjx_arm.kinematics import Poses
 from mjx_arm.options import NotNegative, Positive, options
 from mjx_arm.scene import Scene
@@ -247,4 +248,5 @@ def _find_cube(scene: Scene, arm: Arm) -> tuple[int, int]:
             f"height 0, its centre {half} m above it, got a height of {pose[2]:g} m and the "
             f"quaternion {pose[3:].tolist()}"
         )
+    check_rests(scene, arm, start + 2, "cube")
     return geom, start

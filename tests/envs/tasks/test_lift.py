@@ -288,6 +288,10 @@ PLACE = " 0.36 0 0.025 1 0 0 0"
             {PLACE: " 0.36 0 0.025 0.9659 0.2588 0 0"},
             r"the cube must be level, turned about the vertical only, got .*0\.2588",
         ),
+        (
+            {'name="table" type="plane"': 'name="table" type="plane" pos="0 0 -0.1"'},
+            r"nothing holds the cube, which falls by 0\.0\d+ m in 0\.1 s",
+        ),
     ],
 )
 def test_fingers_and_joints_that_the_task_cannot_use_are_rejected_by_name(
