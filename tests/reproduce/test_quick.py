@@ -19,7 +19,7 @@ def cells(out: pathlib.Path) -> dict[str, float]:
     return {path.name: path.stat().st_mtime for path in (out / "cells").glob("*.json")}
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_an_agent_is_measured_and_the_page_is_the_same_again(tmp_path, capsys):
     """Of the shipped agents, which need no training."""
     root = pathlib.Path(__file__).parents[2] / "benchmarks" / "results"
