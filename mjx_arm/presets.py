@@ -55,6 +55,8 @@ PRESETS: dict[str, TrainConfig] = {
         total_steps=2_100_000,
         select_every=131_072,
         select_episodes=200,
+        teacher_learning_rate=1e-3,
+        student_starts=600_000,
         student_decay_steps=1_300_000,
     ),
     "pixels": train_config(n_step=5),

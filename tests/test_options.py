@@ -291,7 +291,7 @@ def test_what_is_no_text_is_no_name(name, value):
     [
         ("fast", {}, None),
         ("gpu", {}, None),
-        ("fast", {"total_steps": 800_000}, "the agent that is saved learns from step 800,000"),
+        ("fast", {"total_steps": 600_000}, "the agent that is saved learns from step 600,000"),
         ("pixels", {"num_envs": 8_192}, "a chunk has 1 steps of 8192 environments"),
         ("pixels", {"replay_size": 3_200}, "the replay holds 50 steps of each environment"),
         ("pixels", {"num_envs": 512, "chunk_steps": 2**20}, "training samples 0.12 transitions"),
