@@ -23,8 +23,8 @@ from typing import Any
 
 import numpy as np
 from machine import machine
-from transfer import digest
 
+from mjx_arm.reproduce.trials import agent_digest
 from mjx_arm.standin.levels import LEVELS, find_level
 from mjx_arm.standin.opengl import find_opengl
 from mjx_arm.tools.feature_maps import Comparison, compare_moments, draw_comparisons, to_json
@@ -89,8 +89,12 @@ def main() -> None:
         level = find_level(options.level)
         found = compare_moments(agent, level, seed=SEED, episodes=options.starts)
         pictures.append((name, found[0]))
-        rows[name] = {"sha256": digest(path), "picture": to_json(found[0]), "mean": means(found)}
-        rows[name]["moments"] = len(found)
+        rows[name] = {
+            "sha256": agent_digest(path),
+            "picture": to_json(found[0]),
+            "mean": means(found),
+            "moments": len(found),
+        }
         print(name, json.dumps(rows[name]["mean"]), flush=True)
     print(write_files(options, rows, draw_comparisons(pictures)))
 

@@ -457,10 +457,9 @@ def measure_ahead(folder: pathlib.Path, cells: list[Cell], visit: Visit) -> None
             if visit.left() < cell.seconds / 3:
                 print(f"{cell.name}: left out, {visit.left():.0f} s are left", flush=True)
                 continue
-            process.stdin.write("go\n")
-            process.stdin.flush()
             try:
-                process.wait(visit.left() + _GRACE_S)
+                # Also where it has died meanwhile.
+                process.communicate("go\n", visit.left() + _GRACE_S)
             except subprocess.TimeoutExpired:
                 print(f"{cell.name}: not measured in time", flush=True)
                 continue

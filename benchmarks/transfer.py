@@ -17,7 +17,6 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import datetime
-import hashlib
 import json
 import pathlib
 import time
@@ -25,6 +24,7 @@ from typing import Any
 
 from machine import machine
 
+from mjx_arm.reproduce.trials import agent_digest
 from mjx_arm.standin.levels import LEVELS, find_level
 from mjx_arm.tools.transfer import (
     ITERATIONS,
@@ -34,17 +34,12 @@ from mjx_arm.tools.transfer import (
     sample_starts,
     summarise,
 )
-from mjx_arm.training.agent import find_agent, load_agent
+from mjx_arm.training.agent import load_agent
 
 EPSILON, SEED = 0.1, 7
 STARTS = ("home", "in_grasp")
 MOST_READINGS = 3
 TABLE = "transfer.json"
-
-
-def digest(agent: str) -> str:
-    """SHA-256 of an agent's file: a copy under another name is the same agent."""
-    return hashlib.sha256(find_agent(pathlib.Path(agent)).read_bytes()).hexdigest()
 
 
 def note_reading(folder: pathlib.Path, name: str, agent: str, **what: Any) -> None:
@@ -54,7 +49,7 @@ def note_reading(folder: pathlib.Path, name: str, agent: str, **what: Any) -> No
       ValueError: the agent has been read often enough.
     """
     table = read_table(folder)
-    sha256 = digest(agent)
+    sha256 = agent_digest(agent)
     made = [reading for reading in table["readings"] if reading["sha256"] == sha256]
     if len(made) >= MOST_READINGS:
         dates = ", ".join(reading["date"] for reading in made)
@@ -137,9 +132,15 @@ def main() -> None:
             for start in options.starts:
                 began = time.monotonic()
                 outcomes = measure(agent, world, start, options)
-                cell = {"agent": name, "sha256": digest(agent), "world": world, "start": start}
-                cell["epsilon"] = EPSILON
-                cell |= {"seed": SEED, **dataclasses.asdict(outcomes)}
+                cell = {
+                    "agent": name,
+                    "sha256": agent_digest(agent),
+                    "world": world,
+                    "start": start,
+                    "epsilon": EPSILON,
+                    "seed": SEED,
+                    **dataclasses.asdict(outcomes),
+                }
                 cell["seconds"] = round(time.monotonic() - began, 1)
                 print(json.dumps(cell), flush=True)
                 add_cell(options.out, cell)

@@ -68,16 +68,15 @@ class Store:
         Raises:
           ValueError: the file is damaged.
         """
-        path = self.folder / CELLS / f"{name}.json"
-        if not path.is_file():
+        values = self.read_report(name)
+        if values is None:
             return None
         try:
-            values = json.loads(path.read_text(encoding="utf-8"))
             if values.pop("format") != FORMAT:
                 return None
             found = Measured(**{**values, "pictures": tuple(values["pictures"])})
-        except (ValueError, KeyError, TypeError, AttributeError):
-            raise ValueError(f"{path} is damaged: remove it, and it is measured again") from None
+        except (KeyError, TypeError):
+            raise self.damaged(name) from None
         complete = all((self.folder / PICTURES / each).is_file() for each in found.pictures)
         return found if complete else None
 

@@ -21,6 +21,7 @@ from mjx_arm.report.figures import draw_groups
 from mjx_arm.report.run_page import percent
 from mjx_arm.tools.search_space import Dimension, check_space, suggest
 from mjx_arm.tools.zoo import text_table
+from mjx_arm.training.run_folder import CONFIG
 from mjx_arm.training.runner import RunInterruptedError, train
 
 _JOURNAL = "sweep.journal"
@@ -201,17 +202,19 @@ def _run_trial(
             )
             raise optuna.TrialPruned
 
-    quiet = Console(quiet=True)
+    quiet, own = Console(quiet=True), _trial_folder(folder, trial.number)
     try:
         results = train(
             options,
-            _trial_folder(folder, trial.number),
+            own,
             eval_episodes=eval_episodes,
             on_chunk=look,
             video=False,
             console=quiet,
         )
     except ValueError as error:
+        if (own / CONFIG).is_file():
+            raise  # it had begun: a full disk, say, would end the other trials too
         # Such as options that need more memory than there is.
         console.print(f"trial {trial.number}: pruned, {error}", soft_wrap=True)
         raise optuna.TrialPruned(str(error)) from None

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 
 import pytest
+from made_cells import MACHINE
 
 from mjx_arm.reproduce import page
 from mjx_arm.reproduce.agent_sections import table1
@@ -12,14 +13,6 @@ from mjx_arm.reproduce.blocks import Source, Table, Text
 from mjx_arm.reproduce.plan import make_plan
 from mjx_arm.reproduce.store import Measured
 
-MACHINE = {
-    "cpu": "a processor",
-    "cores": 2,
-    "device": "cpu",
-    "python": "3.11",
-    "xla_flags": "",
-    "versions": {"jax": "0.10"},
-}
 RESULT = {
     "env_steps": 1_234_567,
     "episodes": 1_000,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 
 import pytest
+from made_cells import MACHINE
 from made_runs import make_run
 
 from mjx_arm.reproduce import command, studies
@@ -34,16 +35,6 @@ def write(plan, name, result):
     (cell,) = [cell for cell in plan.cells if cell.name == name]
     inputs = json.loads(json.dumps(cell.inputs()))
     plan.store.write(Measured(name, "", inputs, result, (), MACHINE, 1.0, "2026-01-01"), {})
-
-
-MACHINE = {
-    "cpu": "a processor",
-    "cores": 2,
-    "device": "cpu",
-    "python": "3.11",
-    "xla_flags": "",
-    "versions": {"jax": "0.10"},
-}
 
 
 def trial(successes, episodes=100):

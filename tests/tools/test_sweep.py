@@ -111,6 +111,11 @@ def test_a_trial_that_cannot_be_trained_is_pruned_and_one_that_was_cut_off_made_
     trials = sweep(CONFIG, space, tmp_path, trials=3)
     assert [trial.state for trial in trials] == ["pruned", "pruned", "fail", "pruned"]
     assert (tmp_path / "sweep.html").read_text().count("pruned") >= 3
+    # What fails once it has begun is no fault of the options, and ends the sweep.
+    (tmp_path / "trial-004").mkdir()
+    (tmp_path / "trial-004" / "config.json").touch()
+    with pytest.raises(ValueError, match="trial-004 is not empty"):
+        sweep(CONFIG, space, tmp_path, trials=4)
 
 
 @pytest.mark.parametrize(
